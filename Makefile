@@ -1,0 +1,39 @@
+# `make test` on a machine that has Python and nothing else sets everything up and runs the tests.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: help setup test check play train benchmark clean
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "marl_pack needs Python 3.11 or newer"'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+setup: $(STAMP)  ## make the virtual environment and install everything
+
+test: $(STAMP)  ## style, types and tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -n 2
+
+check: test
+
+play: $(STAMP)  ## one game by a heuristic, shown and drawn
+	$(BIN)/python -m marl_pack.play --policy dblf --seed 0 --picture play.png
+
+train: play  ## the main job
+
+benchmark: $(STAMP)  ## every figure of docs/results.md on speed
+	$(BIN)/python -m benchmarks.masks
+	$(BIN)/python -m benchmarks.game
+
+clean:  ## forget compiled code and caches
+	find . -name __pycache__ -prune -exec rm -rf {} +
+	rm -rf .mypy_cache .ruff_cache .pytest_cache build *.egg-info

@@ -1,0 +1,32 @@
+"""What every player is: a function from the game to an orientation and a cell for each bin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from marl_pack.packing import Packing
+
+Policy = Callable[[Packing], tuple[Tensor, Tensor]]
+"""``game -> (orientation int64 [N], cell int64 [N])``, legal wherever ``game.alive``.
+
+Networks, heuristics and random play are all of this form, so one loop plays them all."""
+
+
+def draw(mask: Tensor, generator: torch.Generator) -> Tensor:
+    """One index drawn uniformly from the true entries of each row; 0 where there are none.
+
+    Args:
+        mask: bool [N, K].
+        generator: of the random numbers, on the mask's device.
+
+    Returns:
+        int64 [N].
+    """
+    # Inverse CDF: several times cheaper than torch.multinomial.
+    count = mask.cumsum(1, dtype=torch.int32)
+    point = torch.rand(len(mask), 1, generator=generator, device=mask.device)
+    rank = (point * count[:, -1:]).to(torch.int32)
+    return torch.searchsorted(count, rank, right=True).squeeze(1) * (count[:, -1] > 0)

@@ -1,0 +1,433 @@
+"""Online 3D bin packing as a two-agent PettingZoo environment (AEC).
+
+A conveyor shows one box at a time. ``orientation_0`` turns it, then ``placement_0`` sets it into
+the bin, for good. Both share the reward. Masks hold exactly the actions after which nothing falls
+(Zhou et al. 2024, Algorithms 1 and 2). This module shows one bin of
+:class:`marl_pack.packing.Packing`; no rule of the game stands here.
+
+| | |
+|---|---|
+| Import | ``from marl_pack import env_aec`` |
+| Registered as | ``marl_pack/Packing-v0`` (PettingZoo ≥ 1.27: ``pettingzoo.make("aec", …)``) |
+| Agents | ``["orientation_0", "placement_0"]``, in this order each cycle |
+| Parallel API | yes, turn by turn (:func:`parallel_env`) |
+| Action spaces | ``Discrete(6)`` and ``Discrete(W · D)`` |
+| Observation spaces | ``Dict`` of ``observation: Box(0, 1, (4, W, D), float32)`` and |
+| | ``action_mask: Box(0, 1, (n,), int8)`` with n = 6 and W · D |
+| State space | ``Box(0, 1, (5, W, D), float32)`` |
+
+**Observation.** Four planes: the heightmap and the item's three sides, each plane of a side
+constant. All lengths are divided by the longest side of the bin. The orientation agent sees the
+item's own sides w, d, h; the placement agent sees them along x, y, z in the chosen orientation.
+
+**Legal actions.** An agent's ``action_mask`` is 1 at its legal actions, and all 0 when it is not
+its turn. Orientation o is legal if some cell is; a cell ``x · D + y`` is the item's low corner.
+The six orientations are the rows of :data:`marl_pack.bins.ORIENTATIONS`.
+
+**Reward.** After each placement both agents get ``alpha · v_item - beta · v_waste``, as shares of
+the bin's volume (Eq. 5-7); after each orientation both get 0.
+
+**End.** Both agents terminate together when the next item has no legal action (or there is none),
+and are truncated together after ``max_cycles`` items.
+
+**Info.** For both agents ``utilization`` (share of the bin filled) and ``packed`` (boxes in it).
+
+Version history: v0, first release.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import EzPickle
+from numpy.typing import ArrayLike, NDArray
+from pettingzoo import AECEnv
+from pettingzoo.utils import wrappers
+from pettingzoo.utils.conversions import (
+    aec_to_parallel_wrapper,
+    turn_based_aec_to_parallel_wrapper,
+)
+
+from marl_pack.bins import ORIENTATIONS
+from marl_pack.items import DEFAULT_SIDES, Stream, check_items
+from marl_pack.packing import ALL_ORIENTATIONS, Packing
+from marl_pack.stability import Rule
+from marl_pack.stability.candidates import NO_OFFSET
+
+ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
+AGENTS = [ORIENTATION, PLACEMENT]
+RENDER_MODES = ["human", "rgb_array", "ansi"]
+
+
+def env(*, illegal_reward: float = -1.0, **kwargs: Any) -> AECEnv:
+    """The environment in PettingZoo's usual wrappers.
+
+    Args:
+        illegal_reward: what the agent gets that ends the game by an illegal action (only with
+            ``illegal="terminate"``).
+        **kwargs: of :class:`raw_env`.
+    """
+    environment: AECEnv = raw_env(**kwargs)
+    if environment.unwrapped.illegal == "terminate":
+        environment = wrappers.TerminateIllegalWrapper(environment, illegal_reward=illegal_reward)
+    environment = wrappers.AssertOutOfBoundsWrapper(environment)
+    return wrappers.OrderEnforcingWrapper(environment)
+
+
+def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
+    """The environment in PettingZoo's parallel API.
+
+    By default one step is one turn: all agents may send actions, only that of the acting agent
+    (``infos[agent]["active_agent"]``) is played, and every mask shown is exact.
+
+    With ``simultaneous=True`` one step is one item: both agents act on the same observation, so the
+    placement agent chooses before it can know the orientation. Its mask would be stale, about a
+    third of the placements it allowed would be illegal; here it is all 0 instead, and illegal
+    actions are played as ``illegal`` says. For code that needs every agent to act in every step,
+    ``illegal="repair"`` makes that playable.
+
+    Args:
+        simultaneous: see above.
+        **kwargs: of :func:`env`.
+    """
+    convert = aec_to_parallel_wrapper if simultaneous else turn_based_aec_to_parallel_wrapper
+    return convert(env(**kwargs))
+
+
+class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
+    """One bin, two agents. See the module for agents, spaces, masks, reward and end.
+
+    Args:
+        bin_size: (W, D, H) in cells.
+        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array [L, 3] or [S, L, 3], or a stream.
+        sides: shortest and longest side of generated items.
+        rule: name of a stability rule (:data:`marl_pack.stability.RULES`) or a rule.
+        rule_parameters: what to bind to a named rule, e.g. ``{"margin": 1.0}``.
+        orientations: indices of the orientations that may be chosen.
+        alpha: weight of the volume gained, Eq. 5.
+        beta: weight of the space wasted, Eq. 5.
+        com_offset: the items' centre of mass from their geometric centre, in fractions of w, d, h.
+        max_cycles: items after which an episode is truncated; None for no limit.
+        render_mode: ``"rgb_array"`` (a picture), ``"human"`` (a window) or ``"ansi"`` (text).
+        pad_actions: give both agents the same spaces: ``Discrete(max(6, W · D))``, masks filled up
+            with 0, and a fifth plane: 0 in the orientation agent's turn, 1 in the other's.
+        mask_in: ``"observation"``, or ``"info"``: then the observation is the planes alone and each
+            agent's info holds its ``action_mask``.
+        illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; raises here);
+            ``"repair"``: the nearest legal one is played and the actor's info says so.
+
+    Raises:
+        ValueError: if an argument cannot be, naming what would be right.
+    """
+
+    metadata = {  # noqa: RUF012  # PettingZoo reads it from the class
+        "name": "marl_pack_v0",
+        "render_modes": RENDER_MODES,
+        "render_fps": 2,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        bin_size: tuple[int, int, int] = (10, 10, 10),
+        items: str | Path | ArrayLike | Stream = "rs",
+        *,
+        sides: tuple[int, int] = DEFAULT_SIDES,
+        rule: str | Rule = "hull_alpha",
+        rule_parameters: Mapping[str, Any] | None = None,
+        orientations: Sequence[int] = ALL_ORIENTATIONS,
+        alpha: float = 1.0,
+        beta: float = 1.0,
+        com_offset: tuple[float, float, float] = NO_OFFSET,
+        max_cycles: int | None = None,
+        render_mode: str | None = None,
+        pad_actions: bool = False,
+        mask_in: str = "observation",
+        illegal: str = "terminate",
+    ) -> None:
+        EzPickle.__init__(
+            self, bin_size, items, sides=sides, rule=rule, rule_parameters=rule_parameters,
+            orientations=orientations, alpha=alpha, beta=beta, com_offset=com_offset,
+            max_cycles=max_cycles, render_mode=render_mode, pad_actions=pad_actions,
+            mask_in=mask_in, illegal=illegal,
+        )  # fmt: skip
+        super().__init__()
+        _one_of("mask_in", mask_in, ("observation", "info"))
+        _one_of("illegal", illegal, ("terminate", "repair"))
+        if render_mode is not None:
+            _one_of("render_mode", render_mode, RENDER_MODES)
+        if max_cycles is not None and max_cycles < 1:
+            raise ValueError(f"max_cycles = {max_cycles}: needs at least 1, or None for no limit")
+        self.render_mode, self.max_cycles = render_mode, max_cycles
+        self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
+        self._arguments: dict[str, Any] = {
+            "size": bin_size, "sides": sides, "rule": rule, "rule_parameters": rule_parameters,
+            "orientations": orientations, "alpha": alpha, "beta": beta, "com_offset": com_offset,
+            "auto_reset": False,
+        }  # fmt: skip
+        self._stream_game = Packing(1, items=items, **self._arguments)
+        self._game = self._stream_game
+        self._episode = -1
+        self._seeded = False
+
+        width, depth, _ = self._game.size
+        self._unit = max(self._game.size)
+        choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: width * depth}
+        if pad_actions:
+            choices = dict.fromkeys(AGENTS, max(choices.values()))
+        planes = spaces.Box(0.0, 1.0, (5 if pad_actions else 4, width, depth), np.float32)
+        self.possible_agents = list(AGENTS)
+        self.agents: list[str] = []
+        self.action_spaces = {agent: spaces.Discrete(n) for agent, n in choices.items()}
+        self.observation_spaces = {
+            agent: planes
+            if mask_in == "info"
+            else spaces.Dict(
+                {"observation": planes, "action_mask": spaces.Box(0, 1, (n,), np.int8)}
+            )
+            for agent, n in choices.items()
+        }
+        self.state_space = spaces.Box(0.0, 1.0, (5, width, depth), np.float32)
+        self._window: Any = None
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The agent's observation space, the same object at each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The agent's action space, the same object at each call."""
+        return self.action_spaces[agent]
+
+    # --- the game ---------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Empty the bin and begin an episode.
+
+        Args:
+            seed: begins the item stream anew from this seed. Without one the stream goes on to its
+                next episode (from a random seed if none was ever given).
+            options: ``{"items": array [L, 3]}`` plays that sequence once, whatever the stream.
+
+        Raises:
+            ValueError: for items that cannot be, or a first item that may be set down nowhere.
+        """
+        unknown = set(options or {}) - {"items"}
+        if unknown:
+            # Not an error: PettingZoo's API test sends an option of its own.
+            warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
+        if seed is None and not self._seeded:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        if seed is not None:
+            self._stream_game.seed, self._seeded, self._episode = int(seed), True, -1
+        if options and options.get("items") is not None:
+            given = check_items(options["items"], self._game.size, source='options["items"]')
+            self._game = Packing(1, items=given, **self._arguments)
+        else:
+            self._episode += 1
+            self._game = self._stream_game
+            self._game.reset(first_episode=self._episode)
+        self._game.require_start()
+
+        self.agents = list(AGENTS)
+        self.agent_selection = ORIENTATION
+        self.rewards = dict.fromkeys(AGENTS, 0.0)
+        self._cumulative_rewards = dict.fromkeys(AGENTS, 0.0)
+        self.terminations = dict.fromkeys(AGENTS, False)
+        self.truncations = dict.fromkeys(AGENTS, False)
+        self._cycle = 0
+        self._chosen: int | None = None
+        self._read_game()
+        self.infos = {agent: self._info(agent) for agent in AGENTS}
+
+    def step(self, action: int | None) -> None:
+        """Play the selected agent's action; None once that agent has ended.
+
+        Raises:
+            ValueError: for an illegal action, unless ``illegal="repair"``.
+        """
+        agent = self.agent_selection
+        if self.terminations[agent] or self.truncations[agent]:
+            self._was_dead_step(action)
+            return
+        choice, repaired = self._legal(agent, action)
+        self._cumulative_rewards[agent] = 0.0
+        self._clear_rewards()
+        if agent == ORIENTATION:
+            self._chosen = choice
+        else:
+            self._place(choice)
+        self.agent_selection = PLACEMENT if agent == ORIENTATION else ORIENTATION
+        self._accumulate_rewards()
+        self.infos = {name: self._info(name) for name in self.agents}
+        if repaired:
+            self.infos[agent]["repaired"] = True
+        if self.render_mode == "human":
+            self.render()
+
+    def _place(self, cell: int) -> None:
+        outcome = self._game.place(torch.tensor([self._chosen]), torch.tensor([cell]))
+        self._cycle += 1
+        self._chosen = None
+        self._read_game()
+        ended = bool(outcome.done)
+        out_of_time = self.max_cycles is not None and self._cycle >= self.max_cycles
+        self.rewards = dict.fromkeys(self.agents, float(outcome.reward))
+        self.terminations = dict.fromkeys(self.agents, ended)
+        self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
+
+    def _legal(self, agent: str, action: int | None) -> tuple[int, bool]:
+        """The action to play, and whether it had to be repaired."""
+        mask = self._mask(agent)
+        if action is None or not 0 <= int(action) < len(mask):
+            raise ValueError(f"{agent}: action {action} is not in 0 … {len(mask) - 1}")
+        if mask[int(action)]:
+            return int(action), False
+        legal = np.flatnonzero(mask)
+        if self.illegal != "repair":
+            raise ValueError(
+                f"{agent}: action {action} is not legal; {len(legal)} are, see its action_mask"
+            )
+        if agent == ORIENTATION:
+            return int(legal[np.abs(legal - int(action)).argmin()]), True
+        depth = self._game.size[1]
+        away = np.hypot(legal // depth - int(action) // depth, legal % depth - int(action) % depth)
+        return int(legal[away.argmin()]), True
+
+    # --- what is seen -----------------------------------------------------------------------------
+
+    def _read_game(self) -> None:
+        """Take this cycle's numbers out of the game."""
+        self._packed = int(self._game.bins.count)
+        self._utilization = int(self._game.bins.filled) / math.prod(self._game.size)
+        self._heights = self._game.bins.heightmap[0].numpy() / np.float32(self._unit)
+        self._item = self._game.items[0].numpy()
+        self._masks = self._game.mask[0].numpy()
+        self._orientation_mask = self._game.orientation_mask[0].numpy()
+
+    def _sides(self, turned: bool) -> NDArray[np.int16]:
+        """The item's sides: its own, or along x, y, z once (and if) it is turned."""
+        if turned and self._chosen is not None:
+            return self._item[list(ORIENTATIONS[self._chosen])]
+        return self._item
+
+    def _planes(self, turned: bool, whose_turn: bool) -> NDArray[np.float32]:
+        planes = np.empty((4 + whose_turn, *self._heights.shape), np.float32)
+        planes[0] = self._heights
+        planes[1:4] = (self._sides(turned) / np.float32(self._unit))[:, None, None]
+        if whose_turn:
+            planes[4] = self._chosen is not None
+        return planes
+
+    def _mask(self, agent: str) -> NDArray[np.int8]:
+        """The agent's legal actions; none when it is not its turn."""
+        mask = np.zeros(self.action_spaces[agent].n, np.int8)
+        if agent == ORIENTATION and self._chosen is None:
+            mask[: len(ORIENTATIONS)] = self._orientation_mask
+        elif agent == PLACEMENT and self._chosen is not None:
+            mask[: self._heights.size] = self._masks[self._chosen].ravel()
+        return mask
+
+    def _info(self, agent: str) -> dict[str, Any]:
+        info: dict[str, Any] = {"utilization": self._utilization, "packed": self._packed}
+        if self.mask_in == "info":
+            info["action_mask"] = self._mask(agent)
+        return info
+
+    def observe(self, agent: str) -> Any:
+        """What the agent sees now, whoever's turn it is, and after the end too."""
+        planes = self._planes(agent == PLACEMENT, self.pad_actions)
+        if self.mask_in == "info":
+            return planes
+        return {"observation": planes, "action_mask": self._mask(agent)}
+
+    def state(self) -> NDArray[np.float32]:
+        """Float32 [5, W, D]: heightmap, the item as it lies now, and whose turn it is (0, 1)."""
+        return self._planes(turned=True, whose_turn=True)
+
+    # --- what a person sees -----------------------------------------------------------------------
+
+    def render(self) -> NDArray[np.uint8] | str | None:
+        """The bin, the item to come and where it may go.
+
+        Returns:
+            uint8 [rows, columns, 3] for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
+            (a window shows the picture).
+        """
+        if self.render_mode is None:
+            warnings.warn(
+                f"render() without a render_mode: make the environment with one of {RENDER_MODES}",
+                stacklevel=2,
+            )
+            return None
+        if self.render_mode == "ansi":
+            return self._text()
+        image = self._picture()
+        if self.render_mode == "rgb_array":
+            return image
+        self._show(image)
+        return None
+
+    def _title(self) -> str:
+        return f"{self._packed} boxes, utilization {self._utilization:.1%}"
+
+    def _text(self) -> str:
+        sides = " x ".join(map(str, self._sides(turned=True)))
+        heights = (self._heights * self._unit).round().astype(int)
+        digits = len(str(self._game.size[2]))
+        rows = [" ".join(f"{h:{digits}d}" for h in column) for column in heights.T[::-1]]
+        return "\n".join([self._title(), f"item {sides}", *rows]) + "\n"
+
+    def _picture(self) -> NDArray[np.uint8]:
+        from marl_pack.render import draw  # matplotlib is slow to import, and not always needed
+
+        sides = self._sides(turned=True)
+        chosen = range(len(ORIENTATIONS)) if self._chosen is None else [self._chosen]
+        turned = [" x ".join(str(self._item[axis]) for axis in ORIENTATIONS[o]) for o in chosen]
+        return draw(
+            self._game.size,
+            self._game.bins.boxes[0, : self._packed].numpy(),
+            (int(sides[0]), int(sides[1]), int(sides[2])) if sides.any() else None,
+            self._masks[list(chosen)],
+            turned,
+            self._title(),
+        )
+
+    def _show(self, image: NDArray[np.uint8]) -> None:
+        from matplotlib import pyplot
+
+        if self._window is None:
+            figure, axes = pyplot.subplots(figsize=(image.shape[1] / 100, image.shape[0] / 100))
+            if figure.canvas.required_interactive_framework is None:
+                warnings.warn(
+                    "no display for render_mode='human': matplotlib found no window system; "
+                    "use render_mode='rgb_array' for pictures",
+                    stacklevel=3,
+                )
+            axes.set_position((0, 0, 1, 1))
+            axes.axis("off")
+            self._window = figure, axes.imshow(image)
+            figure.show(warn=False)
+        figure, picture = self._window
+        picture.set_data(image)
+        figure.canvas.draw_idle()
+        figure.canvas.flush_events()
+
+    def close(self) -> None:
+        """Close the window, if one was opened."""
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window[0])
+            self._window = None
+
+
+def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
+    if value not in valid:
+        raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")

@@ -1,0 +1,309 @@
+"""Play policies on item sequences and report what they reach.
+
+``python -m marl_pack.evaluate --policy dblf --items rs --episodes 1000`` prints a table: mean
+utilization with its 95 % interval, its standard deviation, items packed, decisions a second, and
+the share of episodes whose final stack is in strict static equilibrium as a whole, judged by a
+linear program that shares no code with the masks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from scipy import stats
+
+from marl_pack.agents.heuristics import HEURISTICS, make_policy
+from marl_pack.agents.policy import Policy
+from marl_pack.items import DEFAULT_SIDES, GENERATED, Stream, load, make_stream
+from marl_pack.packing import ALL_ORIENTATIONS, Packing
+from marl_pack.stability import RULES, in_equilibrium
+
+BATCH = 1024  # bins played at once
+EPISODES = 1000  # of a generated stream, unless told
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What a policy did in E episodes, one row each."""
+
+    size: tuple[int, int, int]  # W, D, H
+    utilization: NDArray[np.float64]  # [E]
+    packed: NDArray[np.int64]  # [E]          boxes in the bin at the end
+    boxes: NDArray[np.int16]  # [E, M, 6]     x, y, z, w, d, h in order of placement, then zeros
+    loads: NDArray[np.float64]  # [E, M, 3]   weight and x, y of the centre of mass of each box
+    seconds: float  # spent in the game and the policy
+
+
+def play(
+    policy: Policy,
+    game: Callable[[int, int], Packing],
+    episodes: int,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Episodes:
+    """Play episodes 0 … episodes - 1 to their end.
+
+    Args:
+        policy: of both agents.
+        game: (n, first_episode) -> a game of n bins without ``auto_reset``.
+        episodes: how many, E.
+        progress: called with the number of episodes that have just ended.
+    """
+    parts: list[tuple[NDArray[Any], ...]] = []
+    seconds, size = 0.0, (0, 0, 0)
+    for first in range(0, episodes, BATCH):
+        table = game(min(BATCH, episodes - first), first)
+        size = table.size
+        progress(int((~table.alive).sum()))
+        start = time.perf_counter()
+        while bool(table.alive.any()):
+            outcome = table.place(*policy(table))
+            progress(int(outcome.done.sum()))
+        seconds += time.perf_counter() - start
+        bins = table.bins.to("cpu")
+        most = max(int(bins.count.max()), 1)
+        void = torch.arange(most) >= bins.count[:, None]
+        parts.append(
+            (
+                bins.filled.double().numpy() / np.prod(size),
+                bins.count.numpy(),
+                bins.boxes[:, :most].masked_fill(void[..., None], 0).numpy(),
+                bins.loads[:, :most].masked_fill(void[..., None], 0).numpy(),
+            )
+        )
+    most = max(part[2].shape[1] for part in parts)
+
+    def padded(rows: NDArray[Any]) -> NDArray[Any]:
+        return np.pad(rows, ((0, 0), (0, most - rows.shape[1]), (0, 0)))
+
+    return Episodes(
+        size,
+        np.concatenate([part[0] for part in parts]),
+        np.concatenate([part[1] for part in parts]),
+        np.concatenate([padded(part[2]) for part in parts]),
+        np.concatenate([padded(part[3]) for part in parts]),
+        seconds,
+    )
+
+
+def strict_equilibrium(
+    played: Episodes, progress: Callable[[int], object] = lambda done: None
+) -> NDArray[np.bool_]:
+    """Bool [E]: whether each final stack is in strict equilibrium as a whole (HiGHS)."""
+    stands = np.empty(len(played.packed), np.bool_)
+    for e, n in enumerate(played.packed):
+        stands[e] = in_equilibrium(played.boxes[e, :n], played.loads[e, :n])
+        progress(1)
+    return stands
+
+
+def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, float | list[float]]:
+    """The figures of the table; utilization in shares of the bin's volume.
+
+    The interval is Student's, over episodes; [nan, nan] for a single one.
+    """
+    u = played.utilization
+    interval = [float("nan")] * 2
+    if len(u) > 1:
+        bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
+        interval = [float(bounds.low), float(bounds.high)]
+    return {
+        "episodes": len(u),
+        "utilization": float(u.mean()),
+        "interval": interval,
+        "std": float(u.std(ddof=1)) if len(u) > 1 else float("nan"),
+        "packed": float(played.packed.mean()),
+        "decisions_per_second": float(played.packed.sum() / max(played.seconds, 1e-9)),
+        "strict_equilibrium": float(stands.mean()),
+    }
+
+
+def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
+    """Print the table, a row for each policy."""
+    table = Table(title=title)
+    table.add_column("policy")
+    for column in ("episodes", "utilization %", "std", "items", "decisions/s", "strict"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name, row in rows.items():
+        half = (row["interval"][1] - row["interval"][0]) / 2
+        table.add_row(
+            name,
+            str(row["episodes"]),
+            f"{100 * row['utilization']:.2f} ± {100 * half:.2f}",
+            f"{100 * row['std']:.2f}",
+            f"{row['packed']:.2f}",
+            f"{row['decisions_per_second']:,.0f}",
+            f"{100 * row['strict_equilibrium']:.2f} %",
+        )
+    console.print(table)
+    console.print(
+        "±: 95 % interval of the mean; strict: final stacks in strict equilibrium as a whole"
+    )
+
+
+def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
+    """Write a file under another name and move it into place, so that it is whole or not there."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def save_stacks(path: Path, played: Episodes) -> None:
+    """Save the packed boxes as ``.npz``: ``bin`` [3], ``count`` [E], ``boxes``, ``loads``."""
+    write_atomically(
+        path,
+        lambda file: np.savez_compressed(
+            file,
+            bin=np.array(played.size),
+            count=played.packed,
+            boxes=played.boxes,
+            loads=played.loads,
+            utilization=played.utilization,
+        ),
+    )
+
+
+def load_stacks(path: str | Path) -> Episodes:
+    """Read what :func:`save_stacks` wrote.
+
+    Raises:
+        ValueError: if it is another kind of file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            size = tuple(int(s) for s in archive["bin"])
+            return Episodes(
+                (size[0], size[1], size[2]),
+                archive["utilization"],
+                archive["count"],
+                archive["boxes"],
+                archive["loads"],
+                float("nan"),
+            )
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a file of stacks from evaluate --save-stacks") from error
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    options = argparse.ArgumentParser(
+        prog="python -m marl_pack.evaluate",
+        description=__doc__.split("\n\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = options.add_argument
+    add("--policy", nargs="+", default=["dblf"], metavar="NAME",
+        help=f"one or more of {', '.join(HEURISTICS)}")  # fmt: skip
+    add("--items", default="rs", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
+    add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
+        help="bin size in cells (default: the file's own, else 10 10 10)")  # fmt: skip
+    add("--sides", nargs=2, type=int, default=DEFAULT_SIDES, metavar=("SHORTEST", "LONGEST"),
+        help="sides of generated items, in cells")  # fmt: skip
+    add("--rule", default="hull_alpha", choices=list(RULES), help="stability rule of the masks")
+    add("--margin", type=float, help="cells by which the support polygon is shrunk")
+    add("--thresholds", choices=["paper", "code"], help="of the rule area_ratio")
+    add("--orientations", nargs="+", type=int, default=list(ALL_ORIENTATIONS), metavar="O",
+        help="orientations that may be chosen, of 0 … 5")  # fmt: skip
+    add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
+    add("--seed", type=int, default=0, help="of generated items and of random play")
+    add("--device", default="cpu", help="cpu, cuda, cuda:1, …")
+    add("--threads", type=int, default=1, help="of torch on the CPU")
+    add("--json", type=Path, metavar="FILE", help="write the figures there")
+    add("--save-stacks", type=Path, metavar="FILE", help="write the packed boxes there (.npz)")
+    return options
+
+
+def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
+    """Play what the options ask for; a row of figures for each policy.
+
+    Raises:
+        ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
+    """
+    policies = {name: make_policy(name, arguments.seed) for name in arguments.policy}
+    if arguments.save_stacks and len(policies) > 1:
+        raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
+    for path in (arguments.json, arguments.save_stacks):
+        if path is not None and not path.parent.is_dir():
+            raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    size = tuple(arguments.bin) if arguments.bin else (10, 10, 10)
+    stream: Stream
+    if arguments.items in GENERATED:
+        stream = make_stream(arguments.items, size, tuple(arguments.sides))
+    else:
+        stream, size = load(arguments.items, tuple(arguments.bin) if arguments.bin else None)
+    episodes = arguments.episodes
+    if episodes is None:
+        episodes = stream.episodes or EPISODES
+    if episodes < 1 or (stream.episodes and episodes > stream.episodes):
+        most = f" … {stream.episodes}, the sequences of the file" if stream.episodes else " or more"
+        raise ValueError(f"--episodes {episodes}: needs 1{most}")
+    named = {"margin": arguments.margin, "thresholds": arguments.thresholds}
+    parameters = {key: value for key, value in named.items() if value is not None}
+
+    def game(n: int, first_episode: int) -> Packing:
+        return Packing(
+            n, size, stream, rule=arguments.rule, rule_parameters=parameters,
+            orientations=arguments.orientations, device=arguments.device, seed=arguments.seed,
+            first_episode=first_episode, auto_reset=False,
+        )  # fmt: skip
+
+    rows = {}
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    with bar:
+        for name, policy in policies.items():
+            task = bar.add_task(f"{name}: episodes", total=episodes)
+            played = play(policy, game, episodes, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # a default argument binds the task
+            task = bar.add_task(f"{name}: equilibria", total=episodes)
+            stands = strict_equilibrium(played, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # likewise
+            rows[name] = summary(played, stands)
+            if arguments.save_stacks:
+                save_stacks(arguments.save_stacks, played)
+    title = f"{arguments.items}, bin {' x '.join(map(str, size))}, rule {arguments.rule}"
+    if parameters:
+        title += f" ({', '.join(f'{k} {v}' for k, v in parameters.items())})"
+    if set(arguments.orientations) != set(ALL_ORIENTATIONS):
+        title += f", orientations {sorted(set(arguments.orientations))}"
+    show(rows, title, console)
+    if arguments.json:
+        settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
+        report = {"settings": settings | {"bin": size, "episodes": episodes}, "policies": rows}
+        text = json.dumps(report, indent=2, default=str) + "\n"
+        write_atomically(arguments.json, lambda file: file.write(text.encode()))
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command ``python -m marl_pack.evaluate``."""
+    options = parser()
+    chosen = options.parse_args(arguments)
+    torch.set_num_threads(max(1, chosen.threads))
+    try:
+        run(chosen, Console())
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        options.exit(2, f"{options.prog}: {error}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

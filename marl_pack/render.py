@@ -1,0 +1,392 @@
+"""A picture of one bin: the item to come, the boxes in 3D, and where the item may be placed.
+
+The camera is orthographic and always sees the faces of a box towards +x, -y and +z. Matplotlib's
+3D axes sort what they draw by its middle, which is wrong for boxes of different sizes, so boxes are
+projected here and painted from back to front (:func:`paint_order`). Nothing touches pyplot or any
+other global state, so pictures can be drawn in any thread or process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike, NDArray
+
+PALETTE: tuple[str, ...] = (
+    "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
+    "#ff9da7", "#a0cbe8", "#ffbe7d", "#8cd17d", "#d4a6c8", "#d7b5a6", "#499894", "#b6992d",
+)  # fmt: skip
+"""Colours of the boxes by order of placement, used in turn."""
+
+LEGAL = "#18a558"
+"""Colour of the cells where the item may be placed."""
+
+_INK, _FAINT, _BARRED = "#202020", "#909090", "#c0392b"
+
+_ELEVATION, _AZIMUTH = np.radians((27.0, -58.0))
+_TOWARDS_CAMERA = np.array(
+    [
+        np.cos(_ELEVATION) * np.cos(_AZIMUTH),
+        np.cos(_ELEVATION) * np.sin(_AZIMUTH),
+        np.sin(_ELEVATION),
+    ]
+)
+_PROJECTION = np.array(  # x, y, z to right, up
+    [
+        [-np.sin(_AZIMUTH), -np.sin(_ELEVATION) * np.cos(_AZIMUTH)],
+        [np.cos(_AZIMUTH), -np.sin(_ELEVATION) * np.sin(_AZIMUTH)],
+        [0.0, np.cos(_ELEVATION)],
+    ]
+)
+
+# Of a unit box: its corners, its edges, its floor, and round its faces towards +z, +x and -y, the
+# upright ones begun and ended at the bottom.
+_CORNERS = np.array(list(product((0, 1), repeat=3)))
+_EDGES = np.array(
+    [(c, c + axis) for axis in np.eye(3, dtype=int) for c in _CORNERS if not np.dot(c, axis)]
+)
+_FLOOR = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)])
+_FACES = np.array(
+    [
+        [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1), (0, 0, 1)],
+        [(1, 0, 0), (1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 0, 0)],
+        [(0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0), (0, 0, 0)],
+    ]
+)
+_BRIGHTNESS = np.array([1.0, 0.66, 0.83])
+
+_Rect = tuple[float, float, float, float]  # left, bottom, width, height in fractions of the figure
+
+
+def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
+    """What to paint, from back to front, so that no box shows through another.
+
+    Box a, moved by t away from the camera in direction v, meets box b while their intervals overlap
+    on every axis. With y reversed all v_k > 0, and that is for::
+
+        max_k (low_a - high_b)_k / v_k  <  t  <  min_k (high_a - low_b)_k / v_k
+
+    As the boxes are disjoint, t = 0 is never among these: if there are any, all are positive, and a
+    hides a part of b, or all are negative, and b hides a part of a.
+
+    Boxes can hide one another in a ring, so they are painted by levels, one for each height at
+    which a box stands: first whatever stands on the floor, at last whatever stands highest. What is
+    above a level is hidden by nothing below it. Boxes that reach through one level are disjoint in
+    plan, and convex shapes in a plane never hide one another in a ring. So at each level those that
+    reach through it can be painted in order, each from that level up. Only those need it that stand
+    there or hide a part of something painted at this level.
+
+    Args:
+        boxes: int [n, 6], rows x, y, z, w, d, h.
+
+    Returns:
+        Pairs of a box's index and the height from which on it is to be painted.
+
+    Raises:
+        ValueError: if boxes overlap.
+    """
+    view = np.abs(_TOWARDS_CAMERA)
+    low, sides = boxes[:, :3].astype(np.int64), boxes[:, 3:].astype(np.int64)
+    low[:, 1] = -low[:, 1] - sides[:, 1]
+    high = low + sides
+    enter = ((low[:, None] - high) / view).max(-1)
+    leave = ((high[:, None] - low) / view).min(-1)
+    hides = (enter < leave - 1e-9) & (leave > 1e-9)  # [a, b]: a hides a part of b
+    np.fill_diagonal(hides, False)
+
+    order: list[tuple[int, int]] = []
+    for level in np.unique(low[:, 2]).tolist():
+        stands = low[:, 2] == level
+        left = (low[:, 2] <= level) & (level < high[:, 2])
+        painted = np.zeros(len(boxes), dtype=bool)
+        while left.any():
+            following = left & ~hides[:, left].any(1)
+            if not following.any():
+                raise ValueError(f"some of boxes {np.flatnonzero(left).tolist()} overlap")
+            paint = following & (stands | hides[:, painted].any(1))
+            order.extend((i, level) for i in np.flatnonzero(paint).tolist())
+            painted |= paint
+            left &= ~following
+    return order
+
+
+def draw(
+    size: tuple[int, int, int],
+    boxes: NDArray[np.integer],
+    item: tuple[int, int, int] | None = None,
+    masks: NDArray[np.bool_] | None = None,
+    labels: Sequence[str] = (),
+    title: str = "",
+    pixels: tuple[int, int] = (960, 600),
+) -> NDArray[np.uint8]:
+    """Picture of a bin: from left to right the item to come, the bin, and where the item may go.
+
+    The box placed last has a thick outline, in the bin and on the heightmaps. The item is drawn at
+    the bin's scale, in the colour it will have, and smaller only if there is no room.
+
+    Args:
+        size: (W, D, H) in cells.
+        boxes: int [n, 6], rows x, y, z, w, d, h in cells, in order of placement; n may be 0.
+        item: w, d, h in cells of the item to come, as it lies now.
+        masks: bool [A, W, D], the cells where the item's low corner may lie, in A orientations.
+        labels: a title for each of the A masks, or none.
+        title: of the whole picture.
+        pixels: (columns, rows) of the picture.
+
+    Returns:
+        uint8 [rows, columns, 3], RGB.
+
+    Raises:
+        ValueError: if shapes do not match, a box reaches out of the bin, or boxes overlap.
+    """
+    checked = _check(size, boxes, item, masks, labels, pixels)
+    columns, rows = pixels
+    dpi = 100 * min(columns / 960, rows / 600)  # lettering grows with the picture
+    # Half a pixel more, as the canvas rounds down.
+    figure = Figure(((columns + 0.5) / dpi, (rows + 0.5) / dpi), dpi=dpi, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    figure.text(0.5, 0.975, title, ha="center", va="top", size=12, color=_INK, wrap=True)
+
+    beside = 0.28 if masks is None else 0.18
+    left = 0.05 if item is None else beside + 0.04
+    right = 0.93 if masks is None else 0.61
+    scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked)
+    if item is not None:
+        colour = PALETTE[len(boxes) % len(PALETTE)]
+        _draw_item(figure, (0.01, 0.36, beside, 0.40), item, colour, scale)
+    if masks is not None:
+        _draw_masks(figure, (0.68, 0.035, 0.315, 0.89), size, checked, masks, labels)
+
+    figure.canvas.draw()
+    image: NDArray[np.uint8] = np.asarray(canvas.renderer.buffer_rgba())[..., :3].copy()
+    return image
+
+
+def save(path: str | Path, image: NDArray[np.uint8]) -> None:
+    """Write a picture uint8 [rows, columns, 3] to a file of the kind its name ends in, e.g. PNG."""
+    imsave(path, image)
+
+
+def _check(
+    size: tuple[int, int, int],
+    boxes: NDArray[np.integer],
+    item: tuple[int, int, int] | None,
+    masks: NDArray[np.bool_] | None,
+    labels: Sequence[str],
+    pixels: tuple[int, int],
+) -> NDArray[np.int64]:
+    """The boxes as int64 [n, 6], once everything that :func:`draw` was given is found right."""
+    boxes = np.asarray(boxes)
+    if len(size) != 3 or min(size) < 1:
+        raise ValueError(f"size {size!r}: needs three sides W, D, H of at least 1")
+    if boxes.ndim != 2 or boxes.shape[1] != 6 or not np.issubdtype(boxes.dtype, np.integer):
+        raise ValueError(
+            f"boxes are {boxes.dtype} {list(boxes.shape)}: need int [n, 6], rows x, y, z, w, d, h"
+        )
+    checked: NDArray[np.int64] = boxes.astype(np.int64)
+    low, sides = checked[:, :3], checked[:, 3:]
+    outside = (low < 0).any(1) | (sides < 1).any(1) | (low + sides > size).any(1)
+    if outside.any():
+        which = int(outside.argmax())
+        raise ValueError(
+            f"box {which} is {checked[which].tolist()}: x, y, z must be at least 0, w, d, h at "
+            f"least 1, and their sums at most {list(size)}"
+        )
+    if item is not None and (len(item) != 3 or min(item) < 1):
+        raise ValueError(f"item {item!r}: needs three sides w, d, h of at least 1")
+    count = 0
+    if masks is not None:
+        if masks.ndim != 3 or len(masks) < 1 or masks.shape[1:] != tuple(size[:2]):
+            raise ValueError(
+                f"masks are {list(masks.shape)}: need [A, {size[0]}, {size[1]}] with A at least 1"
+            )
+        count = len(masks)
+    if len(labels) not in (0, count):
+        raise ValueError(f"{len(labels)} labels: need one for each of {count} masks, or none")
+    if min(pixels) < 1:
+        raise ValueError(f"pixels {pixels!r}: needs at least one column and one row")
+    return checked
+
+
+def _draw_bin(
+    figure: Figure, rect: _Rect, size: tuple[int, int, int], boxes: NDArray[np.int64]
+) -> float:
+    """Draw the bin in 3D so that it fills ``rect``, and return its scale in pixels per cell."""
+    axes, scale = _axes(figure, rect, size)
+    edges = _EDGES * size
+    near = (_EDGES == (1, 0, 1)).all(-1).any(-1)  # edges that lie in front of all boxes
+    axes.add_collection(PolyCollection([_project(_FLOOR * size)], facecolors="#e8e8e8"))
+    _add_lines(axes, edges[~near], _FAINT, 0.9)
+    _add_boxes(axes, boxes)
+    _add_lines(axes, edges[near], _FAINT, 0.6)
+    if len(boxes):  # the outline of the last box, where others hide it
+        seen = (_EDGES != (0, 1, 0)).any(-1).all(-1)
+        _add_lines(axes, boxes[-1, :3] + _EDGES[seen] * boxes[-1, 3:], _INK, 1.0, ":")
+
+    # Scales along the three edges of the bin that bound its picture below and to the right.
+    origins = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0)]) * size
+    outwards = np.array([(-0.45, -1.0), (0.75, -0.8), (1.0, 0.0)])
+    for axis, name in enumerate("xyz"):
+        side = size[axis]
+        # Each scale begins where the one before it ends, so only the first has a 0.
+        ticks = sorted({0, side // 2, side} if name == "x" else {side // 2, side} - {0})
+        marks = [(float(tick), str(tick), 9, 8) for tick in ticks]
+        for at, text, away, letters in [*marks, (side / 2, name, 22, 10)]:
+            right, up = _project(origins[axis] + at * np.eye(3)[axis])
+            axes.annotate(
+                text,
+                (right, up),
+                xytext=away * outwards[axis],
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                size=letters,
+                color=_INK,
+                annotation_clip=False,
+            )
+    return scale
+
+
+def _draw_item(
+    figure: Figure, rect: _Rect, item: tuple[int, int, int], colour: str, scale: float
+) -> None:
+    """Draw the item to come in the middle of ``rect``, with its sides below."""
+    axes, shown = _axes(figure, rect, item, scale)
+    _add_boxes(axes, np.array([(0, 0, 0, *item)]), [colour], last_edge=0.6)
+    text = "item {} × {} × {}".format(*item)
+    if shown < 0.99 * scale:
+        text += f"\n(drawn at {shown / scale:.0%})"
+    left, bottom, width, _ = rect
+    figure.text(left + width / 2, bottom - 0.03, text, ha="center", va="top", size=11, color=_INK)
+
+
+def _draw_masks(
+    figure: Figure,
+    rect: _Rect,
+    size: tuple[int, int, int],
+    boxes: NDArray[np.int64],
+    masks: NDArray[np.bool_],
+    labels: Sequence[str],
+) -> None:
+    """Draw a heightmap with legal cells for each mask, in two columns unless there is just one."""
+    width, depth, height = size
+    tops = np.zeros((width, depth))
+    for x, y, z, w, d, h in boxes.tolist():
+        under = tops[x : x + w, y : y + d]
+        np.maximum(under, z + h, out=under)
+    grey = np.repeat((0.97 - 0.52 * tops / height)[..., None], 3, axis=-1)
+    lit = 0.25 * grey + 0.75 * np.array(to_rgb(LEGAL))
+
+    columns = min(len(masks), 2)
+    rows = -(-len(masks) // columns)
+    left, bottom, wide, high = rect[0], rect[1], rect[2] / columns, rect[3] / rows
+    for i, mask in enumerate(masks):
+        row, across = divmod(i, columns)
+        # Each panel leaves room for its title above and its ticks below.
+        axes = figure.add_axes(
+            (left + across * wide, bottom + (rows - 1 - row) * high, wide - 0.025, high - 0.095)
+        )
+        axes.imshow(
+            np.where(mask[..., None], lit, grey).transpose(1, 0, 2),
+            origin="lower",
+            extent=(0, width, 0, depth),
+            interpolation="nearest",
+        )
+        if len(boxes):
+            x, y, _, w, d, _ = boxes[-1].tolist()
+            axes.add_patch(Rectangle((x, y), w, d, fill=False, edgecolor=_INK, linewidth=1.6))
+        cells = int(np.count_nonzero(mask))
+        found = {0: "none", 1: "1 cell"}.get(cells, f"{cells} cells")
+        heading = f"{labels[i]}\n{found}" if labels else found
+        axes.set_title(heading, size=9, pad=5, color=_INK if cells else _BARRED)
+        axes.set_xticks((0, width))
+        axes.set_yticks((0, depth))
+        axes.tick_params(labelsize=7, length=2, pad=1, colors=_INK)
+        axes.set_xlabel("x", size=8, labelpad=-8, color=_INK)
+        axes.set_ylabel("y", size=8, labelpad=-8, color=_INK)
+        if not cells:
+            axes.plot((0, width), (0, depth), (0, width), (depth, 0), color=_BARRED, linewidth=0.8)
+        for spine in axes.spines.values():
+            spine.set_color(_FAINT if cells else _BARRED)
+
+
+def _axes(
+    figure: Figure, rect: _Rect, size: tuple[int, int, int], scale: float = np.inf
+) -> tuple[Axes, float]:
+    """Axes for projected points in which a box of ``size`` fills ``rect``, and their scale.
+
+    The scale is in pixels per cell, and no larger than ``scale``.
+    """
+    axes = figure.add_axes(rect)
+    axes.set_axis_off()
+    corners = _project(_CORNERS * size)
+    low, high = corners.min(0), corners.max(0)
+    room = np.multiply(figure.bbox.size, rect[2:])
+    scale = min(scale, float((room / (high - low)).min()))
+    left, bottom = (low + high - room / scale) / 2
+    right, top = (low + high + room / scale) / 2
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    return axes, scale
+
+
+def _project(points: ArrayLike) -> NDArray[np.float64]:
+    """Picture [..., 2], right and up, of points [..., 3]; lengths across the view are kept."""
+    picture: NDArray[np.float64] = np.asarray(points) @ _PROJECTION
+    return picture
+
+
+def _add_lines(
+    axes: Axes, lines: NDArray[np.number], colour: str, width: float, style: str = "-"
+) -> None:
+    """Add lines [m, 2, 3] from point to point."""
+    axes.add_collection(
+        LineCollection(
+            list(_project(lines)),
+            colors=colour,
+            linewidths=width,
+            linestyles=style,
+            clip_on=False,
+            zorder=1,  # as patches have, so that all is drawn in the order of adding
+        )
+    )
+
+
+def _add_boxes(
+    axes: Axes,
+    boxes: NDArray[np.int64],
+    colours: Sequence[str] = PALETTE,
+    last_edge: float = 2.4,
+) -> None:
+    """Add the faces that the camera sees of boxes, the last box with edges so many points wide."""
+    outlines: list[NDArray[np.float64]] = []
+    fills: list[NDArray[np.float64]] = []
+    edges: list[float] = []
+    for i, level in paint_order(boxes):
+        outline = boxes[i, :3] + _FACES * boxes[i, 3:]
+        if level > boxes[i, 2]:  # The upright faces go on below, so they have no edge here.
+            outline[1:, :, 2] = np.maximum(outline[1:, :, 2], level)
+            outline[1:, 4] = outline[1:, 3]
+        outlines.extend(_project(outline))
+        fills.extend(_BRIGHTNESS[:, None] * to_rgb(colours[i % len(colours)]))
+        edges.extend([last_edge if i == len(boxes) - 1 else 0.6] * len(_FACES))
+    axes.add_collection(
+        PolyCollection(
+            outlines,
+            closed=False,
+            facecolors=fills,
+            edgecolors=_INK,
+            linewidths=edges,
+            joinstyle="round",
+            clip_on=False,
+        )
+    )

@@ -1,0 +1,37 @@
+"""Stability rules: where may a box be set down so that nothing falls?
+
+Every rule has one signature, :data:`Rule`, and a name in :data:`RULES`; :func:`make_rule` binds its
+parameters. From the strictest to the loosest, ``hull_alpha`` ⊂ ``lbcp`` ⊂ ``equilibrium`` ⊂
+``hull_1``; ``area_ratio`` stands beside them and is not sound. What each says, one window at a
+time, is in :mod:`marl_pack.stability.reference`.
+
+:func:`stable_mask` answers for plain NumPy arrays, without an environment.
+"""
+
+from marl_pack.stability.arrays import stable_mask
+from marl_pack.stability.candidates import Candidates, Rule, candidates
+from marl_pack.stability.rules import (
+    RULES,
+    area_ratio,
+    equilibrium,
+    hull_1,
+    hull_alpha,
+    lbcp,
+    make_rule,
+)
+from marl_pack.stability.static_equilibrium import in_equilibrium
+
+__all__ = [
+    "RULES",
+    "Candidates",
+    "Rule",
+    "area_ratio",
+    "candidates",
+    "equilibrium",
+    "hull_1",
+    "hull_alpha",
+    "in_equilibrium",
+    "lbcp",
+    "make_rule",
+    "stable_mask",
+]

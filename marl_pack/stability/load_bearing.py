@@ -1,0 +1,132 @@
+"""Load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123) on a raster.
+
+A box whose centre of mass lies in a polygon of load-bearing contact can itself carry any load
+inside that polygon, so gap cells under its top may count for the next box. A cell counts only if
+its whole square lies in the polygon; asking for one corner, as a raster invites to, is unsound.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from marl_pack.bins import Bins, footprint
+from marl_pack.stability.hull_cpu import envelope
+from marl_pack.stability.hull_torch import PAIR_CELLS, boundary, windows
+
+
+@njit(cache=True)
+def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
+    """The chain's y at ``x``, rounded into the hull (sign +1: upper chain, down)."""
+    for i in range(size - 1):
+        ax, ay, bx, by = chain[i, 0], chain[i, 1], chain[i + 1, 0], chain[i + 1, 1]
+        if ax <= x <= bx:
+            return sign * ((sign * (ay * (bx - ax) + (by - ay) * (x - ax))) // (bx - ax))
+    return 0
+
+
+@njit(cache=True)
+def _carry(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
+    """Fill ``cells`` [w, d] up to the hull of its true squares: whole squares only."""
+    w, d = cells.shape
+    if cells[0, 0] and cells[0, d - 1] and cells[w - 1, 0] and cells[w - 1, d - 1]:
+        cells[:] = True
+        return
+    for i in range(w):
+        lo[i], hi[i] = d, -1
+        for j in range(d):
+            if cells[i, j]:
+                lo[i], hi[i] = min(lo[i], j), j
+    n_upper, n_lower = envelope(lo[:w], hi[:w], upper, lower)
+    if n_upper == 0:
+        return
+    for i in range(upper[0, 0], upper[n_upper - 1, 0]):
+        top = min(_chain_at(upper, n_upper, i, 1), _chain_at(upper, n_upper, i + 1, 1))
+        bottom = max(_chain_at(lower, n_lower, i, -1), _chain_at(lower, n_lower, i + 1, -1))
+        for j in range(bottom, top):
+            cells[i, j] = True
+
+
+@njit(cache=True, nogil=True)
+def _bearing_cpu(boxes: Any, count: Any, out: Any) -> None:
+    n, width, depth = out.shape
+    height = np.empty((width, depth), np.int64)
+    lo, hi = np.empty(width, np.int64), np.empty(width, np.int64)
+    upper, lower = np.empty((2 * width + 2, 2), np.int64), np.empty((2 * width + 2, 2), np.int64)
+    for b in range(n):
+        height[:] = 0
+        out[b] = True
+        for k in range(count[b]):
+            x, y, z, w, d, h = boxes[b, k]
+            cells = out[b, x : x + w, y : y + d]
+            for i in range(w):
+                for j in range(d):
+                    cells[i, j] &= height[x + i, y + j] == z
+                    height[x + i, y + j] = z + h
+            _carry(cells, lo, hi, upper, lower)
+
+
+def _bearing_torch(bins: Bins) -> Tensor:
+    """The same box by box, all bins at once."""
+    n, (width, depth, _) = len(bins), bins.size
+    height = torch.zeros_like(bins.heightmap)
+    bearing = torch.ones_like(height, dtype=torch.bool)
+    for k in range(int(bins.count.max()) if n else 0):
+        here = torch.nonzero(bins.count > k).squeeze(1)
+        corner, rest, sides = bins.boxes[here, k].long().tensor_split((2, 3), 1)
+        under = footprint(bins[here], sides, corner[:, 0] * depth + corner[:, 1])
+        x, y = corner[:, 0], corner[:, 1]
+        held = bearing[here] & (height[here] == rest[:, None]) & under
+        rows = torch.arange(len(here), device=bins.device)
+        window, member = windows(held, rows, x, y, sides)
+        present, upper, lower = boundary(window & member)
+        top, bottom = _rounded(upper, present), _rounded(lower, present)
+        top = torch.minimum(top[:, :-1], top[:, 1:])  # over each row of cells
+        bottom = torch.minimum(bottom[:, :-1], bottom[:, 1:])
+        i = torch.arange(width, device=bins.device) - x[:, None]
+        j = torch.arange(depth, device=bins.device) - y[:, None]
+        i = i.clamp(0, top.shape[1] - 1)
+        above = j[:, None, :] >= -bottom.gather(1, i)[:, :, None]
+        below = j[:, None, :] + 1 <= top.gather(1, i)[:, :, None]
+        bearing[here] = torch.where(under, above & below, bearing[here])
+        height[here] = torch.where(
+            under, (rest + sides[:, 2:])[:, :, None], height[here].long()
+        ).to(height.dtype)
+    return bearing
+
+
+def _rounded(points: Tensor, present: Tensor) -> Tensor:
+    """The upper chain of the hull over x = 0 … P - 1, rounded down, int64 [U, P].
+
+    The floor of a maximum is the maximum of the floors, so every pair of points may speak.
+    """
+    size = points.shape[1]
+    x = torch.arange(size, device=points.device)
+    ex = (x[None, :] - x[:, None]).clamp(min=1)  # [i, j]
+    between = (x[:, None, None] <= x) & (x <= x[None, :, None])  # [i, j, x]
+    run = x[None, None, :] - x[:, None, None]
+    out = torch.empty_like(points)
+    chunk = max(1, PAIR_CELLS // size**3)
+    low = torch.iinfo(points.dtype).min
+    for start in range(0, len(points), chunk):
+        p, here = points[start : start + chunk], present[start : start + chunk]
+        ey = p[:, None, :] - p[:, :, None]
+        rise = torch.div(ey[..., None] * run, ex[:, :, None], rounding_mode="floor")
+        ok = between & here[:, :, None, None] & here[:, None, :, None]
+        out[start : start + chunk] = (
+            torch.where(ok, p[:, :, None, None] + rise, low).flatten(1, 2).amax(1)
+        )
+    return out.clamp(min=-(1 << 30))
+
+
+def lbcp_bearing(bins: Bins) -> Tensor:
+    """Bool [N, W, D]: the columns whose top carries any load, replayed from the placed boxes."""
+    if bins.device.type != "cpu":
+        return _bearing_torch(bins)
+    out = np.empty(tuple(bins.heightmap.shape), np.bool_)
+    _bearing_cpu(bins.boxes.contiguous().numpy(), bins.count.numpy(), out)
+    return torch.from_numpy(out)

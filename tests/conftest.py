@@ -1,0 +1,68 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from marl_pack import bins as state
+from marl_pack.bins import Bins
+from marl_pack.stability import Rule, candidates
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The published test sequences, where MARL_PACK_DATA says they are."""
+    folder = os.environ.get("MARL_PACK_DATA")
+    if not folder or not (Path(folder) / "rs.npz").is_file():
+        pytest.skip("MARL_PACK_DATA does not name a folder with rs.npz and cut_1.npz")
+    return Path(folder)
+
+
+def stack(size: tuple[int, int, int], *boxes: tuple[int, int, int, int, int, int]) -> Bins:
+    """One bin with boxes x, y, z, w, d, h set into it; fails if one does not rest at its z."""
+    bins = state.empty(1, size, max_boxes=len(boxes) + 1)
+    for x, y, z, w, d, h in boxes:
+        rest, _ = state.place(
+            bins, torch.tensor([[w, d, h]], dtype=torch.int16), torch.tensor([x * size[1] + y])
+        )
+        assert int(rest) == z, f"box {(x, y, z, w, d, h)} rests at {int(rest)}"
+    return bins
+
+
+def random_play(
+    rule: Rule, n: int, size: tuple[int, int, int], sides: tuple[int, int], steps: int, seed: int
+) -> Bins:
+    """N bins in which up to ``steps`` random boxes stand where ``rule`` allows them."""
+    generator = torch.Generator().manual_seed(seed)
+    bins = state.empty(n, size, max_boxes=steps)
+    for _ in range(steps):
+        items = torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
+        allowed = rule(bins, candidates(items))[:, 0].flatten(1)
+        cell = torch.multinomial(
+            allowed.float() + ~allowed.any(1, keepdim=True), 1, generator=generator
+        )
+        state.place(bins, torch.where(allowed.any(1, keepdim=True), items, 0), cell[:, 0])
+    return bins
+
+
+def random_maps(
+    n: int, size: tuple[int, int, int], sides: tuple[int, int], steps: int, seed: int
+) -> Bins:
+    """N bins in which boxes were dropped anywhere, standing or not."""
+
+    def anywhere(bins: Bins, item) -> torch.Tensor:  # type: ignore[no-untyped-def]
+        from marl_pack.stability.hull_torch import fits, resting_height
+
+        rest = resting_height(bins.heightmap, item.sides)
+        room = rest + item.sides[..., 2, None, None] <= bins.height
+        flat = fits(item.sides.flatten(0, 1).long(), *bins.size[:2])
+        return room & flat.unflatten(0, item.sides.shape[:2])
+
+    return random_play(anywhere, n, size, sides, steps, seed)
+
+
+def boxes_of(bins: Bins, i: int) -> np.ndarray:
+    return bins.boxes[i, : int(bins.count[i])].numpy()

@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+import torch
+from conftest import boxes_of, random_maps, stack
+
+from marl_pack import bins as state
+from marl_pack.bins import ORIENTATIONS, oriented
+
+
+def test_a_box_raises_its_footprint_and_counts_the_gap_below_it() -> None:
+    # Seen from the front: a 2-wide box of height 3, bridged by a 4-wide one.
+    #   z=3 . B B B B
+    #   z=0 . A A . .
+    bins = stack((6, 1, 8), (1, 0, 0, 2, 1, 3), (1, 0, 3, 4, 1, 2))
+    assert bins.heightmap[0, :, 0].tolist() == [0, 5, 5, 5, 5, 0]
+    assert bins.empty_map[0, :, 0].tolist() == [0, 0, 0, 3, 3, 0]
+    assert int(bins.filled) == 6 + 8
+    assert float(state.utilization(bins)) == pytest.approx(14 / 48)
+    assert bins.loads[0, 1].tolist() == [8, 3.0, 0.5]
+
+
+def test_gaps_under_gaps_add_up() -> None:
+    bins = stack((5, 1, 9), (0, 0, 0, 1, 1, 2), (0, 0, 2, 3, 1, 1), (2, 0, 3, 3, 1, 1))
+    assert bins.empty_map[0, :, 0].tolist() == [0, 2, 2, 3, 3]
+
+
+def test_place_tells_resting_height_and_waste() -> None:
+    bins = stack((6, 6, 9), (0, 0, 0, 3, 3, 4))
+    rest, waste = state.place(
+        bins, torch.tensor([[4, 2, 1]], dtype=torch.int16), torch.tensor([1 * 6 + 2])
+    )
+    assert int(rest) == 4
+    assert int(waste) == 8 * 4 - 2 * 4  # 8 columns, of which x = 1, 2 at y = 2 are filled
+
+
+def test_heightmap_minus_empty_map_is_what_the_boxes_fill() -> None:
+    bins = random_maps(32, (7, 5, 12), (1, 4), 20, seed=0)
+    for i in range(32):
+        filled = np.zeros((7, 5), int)
+        for x, y, _, w, d, h in boxes_of(bins, i):
+            filled[x : x + w, y : y + d] += h
+        assert (bins.heightmap[i].numpy() - bins.empty_map[i].numpy() == filled).all()
+        assert int(bins.filled[i]) == filled.sum()
+
+
+def test_a_zero_sided_box_changes_nothing() -> None:
+    bins = stack((4, 4, 4), (0, 0, 0, 2, 2, 2))
+    before = bins.clone()
+    state.place(bins, torch.zeros(1, 3, dtype=torch.int16), torch.tensor([0]))
+    for now, then in zip(bins.tensors(), before.tensors(), strict=True):
+        assert torch.equal(now, then)
+
+
+def test_tensor_code_places_as_the_compiled_code_does() -> None:
+    generator = torch.Generator().manual_seed(1)
+    one = state.empty(40, (6, 9, 20), max_boxes=15)
+    other = one.clone()
+    for step in range(15):
+        sides = torch.randint(0, 5, (40, 3), generator=generator).short()
+        x, y = (torch.randint(0, s - 3, (40,), generator=generator) for s in (6, 9))
+        weights = torch.rand(40, generator=generator) if step % 2 else None
+        com = torch.rand(40, 2, generator=generator).double() if step % 3 else None
+        told = state._place_cpu(one, sides, x * 9 + y, weights, com)
+        again = state._place_torch(other, sides, x * 9 + y, weights, com)
+        for a, b in zip(told, again, strict=True):
+            assert torch.equal(a.long(), b.long())
+    held = torch.arange(15) < one.count[:, None]
+    for a, b in zip(one.tensors(), other.tensors(), strict=True):
+        same = a == b
+        assert same.all() if a.shape[:2] != held.shape else same[held].all()
+
+
+def test_orientations_are_the_six_permutations_in_turned_pairs() -> None:
+    assert len(set(ORIENTATIONS)) == 6
+    assert ORIENTATIONS[0] == (0, 1, 2)
+    for o, (a, b, c) in enumerate(ORIENTATIONS):
+        assert ORIENTATIONS[o ^ 1] == (b, a, c)
+        assert c == 2 - o // 2
+    assert oriented(torch.tensor([3, 4, 5]))[2].tolist() == [3, 5, 4]
+
+
+@pytest.mark.parametrize("size", [(0, 5, 5), (5, 5), (5, 5.5, 5), (5, 5, 16384)])
+def test_an_impossible_bin_is_refused(size: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"bin (size|height)"):
+        state.empty(1, size)  # type: ignore[arg-type]
+
+
+def test_cleared_bins_are_empty_and_the_others_untouched() -> None:
+    bins = random_maps(6, (5, 5, 9), (1, 4), 6, seed=3)
+    before = bins.clone()
+    state.clear(bins, torch.tensor([1, 4]))
+    kept = torch.tensor([0, 2, 3, 5])
+    assert int(bins.filled[[1, 4]].sum()) == 0
+    assert int(bins.heightmap[[1, 4]].sum()) == 0
+    for now, then in zip(bins[kept].tensors(), before[kept].tensors(), strict=True):
+        assert torch.equal(now, then)

@@ -1,0 +1,168 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marl_pack import evaluate
+from marl_pack import play as play_command
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.evaluate import Episodes, load_stacks, strict_equilibrium, summary
+from marl_pack.packing import Packing
+
+
+def test_the_table_the_json_and_the_stacks_agree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, stacks = tmp_path / "out.json", tmp_path / "stacks.npz"
+    arguments = "--policy dblf --items rs --episodes 40 --seed 3".split()
+    assert evaluate.main([*arguments, "--json", str(out), "--save-stacks", str(stacks)]) == 0
+    report = json.loads(out.read_text())
+    row = report["policies"]["dblf"]
+    played = load_stacks(stacks)
+    assert row["episodes"] == len(played.utilization) == 40
+    assert row["utilization"] == pytest.approx(played.utilization.mean())
+    assert row["packed"] == pytest.approx(played.packed.mean())
+    assert row["strict_equilibrium"] == 1.0
+    assert report["settings"]["seed"] == 3
+    assert f"{100 * row['utilization']:.2f}" in capsys.readouterr().out
+    # The stacks hold the boxes that make the utilization.
+    volume = played.boxes[..., 3:].astype(int).prod(2).sum(1)
+    assert (volume / 1000 == played.utilization).all()
+    assert ((played.boxes[..., 3] > 0).sum(1) == played.packed).all()
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_what_is_played_does_not_depend_on_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    def played() -> Episodes:
+        return evaluate.play(
+            make_policy("best_fit"),
+            lambda n, first: Packing(n, seed=1, first_episode=first, auto_reset=False),
+            25,
+        )
+
+    whole = played()
+    monkeypatch.setattr(evaluate, "BATCH", 7)
+    parts = played()
+    assert (whole.utilization == parts.utilization).all()
+    assert (whole.boxes == parts.boxes).all()
+    assert (whole.loads == parts.loads).all()
+
+
+def test_progress_counts_every_episode_once() -> None:
+    counted: list[int] = []
+    evaluate.play(
+        make_policy("random"),
+        lambda n, first: Packing(n, first_episode=first, auto_reset=False),
+        30,
+        counted.append,
+    )
+    assert sum(counted) == 30
+
+
+def test_the_summary_is_as_worked_by_hand() -> None:
+    played = Episodes(
+        (10, 10, 10),
+        np.array([0.5, 0.6, 0.7]),
+        np.array([5, 6, 10]),
+        np.zeros((3, 1, 6), np.int16),
+        np.zeros((3, 1, 3)),
+        seconds=3.0,
+    )
+    figures = summary(played, np.array([True, True, False]))
+    assert figures["utilization"] == pytest.approx(0.6)
+    assert figures["std"] == pytest.approx(0.1)
+    # Student's t with two degrees of freedom: 4.3027 · 0.1 / √3
+    assert figures["interval"] == pytest.approx([0.6 - 0.24841, 0.6 + 0.24841], abs=1e-4)
+    assert figures["packed"] == pytest.approx(7)
+    assert figures["decisions_per_second"] == pytest.approx(7)
+    assert figures["strict_equilibrium"] == pytest.approx(2 / 3)
+
+
+def test_a_stack_that_falls_is_counted() -> None:
+    boxes = np.zeros((2, 2, 6), np.int16)
+    boxes[0] = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 4, 2, 1)]  # balanced on the edge
+    boxes[1] = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 3, 2, 1)]
+    loads = np.array([[(8, 1, 1), (8, 2, 1)], [(8, 1, 1), (6, 1.5, 1)]], np.float64)
+    count = np.array([2, 2])
+    played = Episodes((9, 9, 9), np.zeros(2), count, boxes, loads, 1.0)
+    assert strict_equilibrium(played).tolist() == [False, True]
+
+
+def test_no_rule_but_a_sound_one_keeps_every_stack_standing(tmp_path: Path) -> None:
+    shares = {}
+    for rule in ("hull_1", "hull_alpha", "lbcp", "equilibrium"):
+        out = tmp_path / f"{rule}.json"
+        arguments = f"--policy random --rule {rule} --episodes 150 --json {out}".split()
+        assert evaluate.main(arguments) == 0
+        shares[rule] = json.loads(out.read_text())["policies"]["random"]["strict_equilibrium"]
+    assert shares["hull_1"] < 1
+    assert [shares[rule] for rule in ("hull_alpha", "lbcp", "equilibrium")] == [1, 1, 1]
+
+
+def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    names = ["dblf", "height_min", "best_fit", "random"]
+    evaluate.main(["--policy", *names, "--episodes", "200", "--json", str(out)])
+    rows = json.loads(out.read_text())["policies"]
+    for name in names[:3]:
+        assert rows[name]["interval"][0] > rows["random"]["interval"][1] + 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        ("--policy nobody", "unknown policy 'nobody'"),
+        ("--items missing.npz", "no such file"),
+        ("--items sr", "unknown items|no such file"),
+        ("--episodes 0", "--episodes 0"),
+        ("--margin -1", "margin"),
+        ("--thresholds code", "no parameter 'thresholds'"),
+        ("--bin 10 10 0", "bin size"),
+        ("--bin 4 4 4", "longest side"),
+        ("--orientations 7", "orientations"),
+        ("--json nowhere/out.json", "does not exist"),
+        ("--policy dblf random --save-stacks s.npz", "one policy"),
+    ],
+)
+def test_what_cannot_be_is_refused_without_a_traceback(
+    arguments: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main(arguments.split())
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert "Traceback" not in message
+    assert pytest.importorskip("re").search(why, message)
+
+
+def test_more_episodes_than_a_file_has_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "items.csv"
+    path.write_text("w,d,h\n2,2,2\n3,3,3\n")
+    options = ["--items", str(path), "--bin", "5", "5", "5"]
+    with pytest.raises(SystemExit):
+        evaluate.main([*options, "--episodes", "2"])
+    assert "1 … 1" in capsys.readouterr().err
+    assert evaluate.main(options) == 0
+
+
+def test_a_foreign_file_of_stacks_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(ValueError, match="not a file of stacks"):
+        load_stacks(path)
+
+
+def test_play_shows_the_game_and_draws_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bin.png"
+    assert play_command.main(["--policy", "dblf", "--picture", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "in strict equilibrium" in text
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    with pytest.raises(SystemExit):
+        play_command.main(["--picture", "bin.xyz"])
+    assert "ending .png" in capsys.readouterr().err

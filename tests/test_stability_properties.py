@@ -1,0 +1,387 @@
+"""What holds for every state: the rules' order, their symmetry, and equality of all codes."""
+
+import itertools
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import boxes_of, random_maps, random_play
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from marl_pack import bins as state
+from marl_pack.bins import Bins, oriented
+from marl_pack.stability import (
+    RULES,
+    Candidates,
+    candidates,
+    equilibrium,
+    hull_1,
+    hull_alpha,
+    hull_cpu,
+    hull_torch,
+    in_equilibrium,
+    lbcp,
+    make_rule,
+    reference,
+    support_area,
+)
+from marl_pack.stability.load_bearing import _bearing_torch, lbcp_bearing
+from marl_pack.stability.static_equilibrium import STRICT, least_force
+
+PLACES = [((5, 5, 6), (1, 4)), ((7, 4, 9), (1, 5)), ((10, 10, 10), (2, 5)), ((3, 8, 200), (1, 7))]
+
+
+def some_items(n: int, sides: tuple[int, int], seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
+
+
+def off_centre(items: Tensor, seed: int) -> Candidates:
+    """Candidates with a centre of mass anywhere in the middle half of each footprint."""
+    generator = torch.Generator().manual_seed(seed)
+    sides = oriented(items)
+    share = 0.25 + 0.5 * torch.rand(*sides.shape[:2], 2, generator=generator, dtype=torch.float64)
+    return Candidates(sides, share * sides[..., :2])
+
+
+# --- the batched codes against the plain reference ------------------------------------------------
+
+
+def expected(
+    bins: Bins, item: Candidates, stands: Callable[[int, int, int, int, int, int], bool]
+) -> np.ndarray:
+    """Every cell by ``stands(bin, candidate, x, y, w, d)``, in a loop."""
+    sides = item.sides.numpy()
+    return np.array(
+        [
+            [
+                reference.window_mask(
+                    lambda x, y, b=b, a=a, w=w, d=d: stands(b, a, x, y, w, d),  # type: ignore[misc]
+                    bins.heightmap[b].numpy(),
+                    (w, d, h),
+                    bins.height,
+                )
+                for a, (w, d, h) in enumerate(sides[b].tolist())
+            ]
+            for b in range(len(bins))
+        ]
+    )
+
+
+@pytest.mark.parametrize(("size", "sides"), PLACES)
+@pytest.mark.parametrize("margin", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("com", ["central", "off centre"])
+@pytest.mark.parametrize("bearing", ["hull_1", "hull_alpha", "lbcp"])
+def test_hull_masks_equal_the_reference_cell_by_cell(
+    size: tuple[int, int, int], sides: tuple[int, int], margin: float, com: str, bearing: str
+) -> None:
+    bins = random_maps(12, size, sides, 12, seed=1)
+    items = some_items(12, sides, 2)
+    item = candidates(items) if com == "central" else off_centre(items, 3)
+    holds = {
+        "hull_1": torch.ones_like(bins.empty_map, dtype=torch.bool),
+        "hull_alpha": bins.empty_map == 0,
+        "lbcp": torch.from_numpy(
+            np.array([reference.lbcp_bearing(size[:2], boxes_of(bins, b)) for b in range(12)])
+        ),
+    }[bearing]
+
+    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
+        window = np.s_[b, x : x + w, y : y + d]
+        centre = tuple(item.centres()[b, a].tolist())
+        return reference.hull(bins.heightmap.numpy()[window], holds.numpy()[window], centre, margin)  # type: ignore[arg-type]
+
+    want = expected(bins, item, stands)
+    assert (make_rule(bearing, margin=margin)(bins, item).numpy() == want).all()
+    tensor = hull_torch.support_mask(
+        bins.heightmap, holds, item.sides, bins.height, item.com, margin
+    )
+    assert (tensor.numpy() == want).all()
+
+
+@pytest.mark.parametrize(("size", "sides"), PLACES)
+@pytest.mark.parametrize("thresholds", ["paper", "code"])
+def test_area_masks_equal_the_reference_cell_by_cell(
+    size: tuple[int, int, int], sides: tuple[int, int], thresholds: str
+) -> None:
+    bins = random_maps(12, size, sides, 12, seed=4)
+    item = candidates(some_items(12, sides, 5))
+    pairs = support_area.check_thresholds(thresholds)
+
+    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
+        return reference.area_ratio(bins.heightmap[b, x : x + w, y : y + d].numpy(), pairs)
+
+    want = expected(bins, item, stands)
+    assert (make_rule("area_ratio", thresholds=thresholds)(bins, item).numpy() == want).all()
+    tensor = support_area.mask_torch(bins.heightmap, item.sides, bins.height, pairs)
+    assert (tensor.numpy() == want).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_load_bearing_maps_equal_the_reference_cell_by_cell(seed: int) -> None:
+    bins = random_maps(60, (8, 7, 25), (1, 6), 15, seed=seed)
+    compiled = lbcp_bearing(bins)
+    assert torch.equal(compiled, _bearing_torch(bins))
+    for b in range(60):
+        want = reference.lbcp_bearing((8, 7), boxes_of(bins, b))
+        assert (compiled[b].numpy() == want).all()
+    assert (compiled & (bins.empty_map > 0)).any()  # some gaps do carry
+
+
+@pytest.mark.parametrize("size", [(10, 10, 10), (40, 30, 50), (33, 64, 300)])
+def test_larger_maps_are_equal_on_cpu_and_tensor_code(size: tuple[int, int, int]) -> None:
+    longest = min(size) // 2
+    bins = random_maps(24, size, (2, longest), 25, seed=6)
+    for seed in range(3):
+        items = some_items(24, (2, longest), seed)
+        for item in (candidates(items), off_centre(items, seed)):
+            for margin in (0.0, 1.3):
+                got = hull_cpu.support_mask(
+                    bins.heightmap.numpy(),
+                    (bins.empty_map == 0).numpy(),
+                    item.sides.numpy(),
+                    bins.height,
+                    None if item.com is None else item.com.numpy(),
+                    margin,
+                )
+                want = hull_torch.support_mask(
+                    bins.heightmap, bins.empty_map == 0, item.sides, bins.height, item.com, margin
+                )
+                assert (got == want.numpy()).all()
+
+
+@pytest.mark.parametrize(("size", "sides"), PLACES)
+def test_hull_alpha_equals_opencvs_hull_of_the_squares_corners(
+    size: tuple[int, int, int], sides: tuple[int, int]
+) -> None:
+    bins = random_maps(12, size, sides, 12, seed=7)
+    item = candidates(some_items(12, sides, 8))
+
+    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
+        heights = bins.heightmap[b, x : x + w, y : y + d].numpy()
+        held = (heights == heights.max()) & (bins.empty_map[b, x : x + w, y : y + d].numpy() == 0)
+        if not held.any():
+            return False
+        points = (2 * reference.corners(held)).astype(np.int32)  # half cells are whole
+        return cv2.pointPolygonTest(cv2.convexHull(points), (float(w), float(d)), False) > 0
+
+    assert (hull_alpha(bins, item).numpy() == expected(bins, item, stands)).all()
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2**36 - 1), st.floats(0.1, 5.9), st.floats(0.1, 5.9), st.floats(0, 2))
+def test_any_pattern_of_contact_is_judged_as_the_reference_does(
+    bits: int, x: float, y: float, margin: float
+) -> None:
+    cells = np.array([bits >> k & 1 for k in range(36)], dtype=bool).reshape(6, 6)
+    heights = torch.from_numpy(cells.astype(np.int16))[None]
+    bearing = torch.ones(1, 6, 6, dtype=torch.bool)
+    item = Candidates(
+        torch.tensor([[[6, 6, 1]]], dtype=torch.int16),
+        torch.tensor([[[x, y]]], dtype=torch.float64),
+    )
+    bins = state.empty(1, (6, 6, 5), max_boxes=0)
+    bins.heightmap.copy_(heights)
+    contact = cells if cells.any() else ~cells
+    polygon = reference.convex_hull(reference.corners(contact))
+    if abs(reference.clearance(polygon, (x, y)) - margin) < 1e-9:
+        return  # too close for floating point numbers to tell
+    want = reference.supported(contact, (x, y), margin)
+    assert bool(hull_1(bins, item, margin)[0, 0, 0, 0]) == want
+    tensor = hull_torch.support_mask(heights, bearing, item.sides, 5, item.com, margin)
+    assert bool(tensor[0, 0, 0, 0]) == want
+
+
+# --- the order of the rules -----------------------------------------------------------------------
+
+
+def assert_order(bins: Bins, item: Candidates) -> tuple[int, int, int, int]:
+    alpha, load, exact, one = (rule(bins, item) for rule in (hull_alpha, lbcp, equilibrium, hull_1))
+    assert not (alpha & ~load).any()
+    assert not (load & ~exact).any()
+    assert not (exact & ~one).any()
+    return tuple(int(m.sum()) for m in (alpha, load, exact, one))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("rule", ["hull_alpha", "lbcp", "equilibrium"])
+@pytest.mark.parametrize(("size", "sides"), PLACES)
+def test_alpha_within_lbcp_within_equilibrium_within_hull_1(
+    rule: str, size: tuple[int, int, int], sides: tuple[int, int]
+) -> None:
+    bins = random_play(make_rule(rule), 60, size, sides, 14, seed=9)
+    sizes = assert_order(bins, candidates(some_items(60, sides, 10)))
+    if size == (10, 10, 10):
+        assert sizes[0] < sizes[1] < sizes[2] < sizes[3]  # the inclusions are strict
+
+
+def test_the_order_holds_on_every_small_stack_of_three() -> None:
+    """All stacks of three boxes of sides 1 … 3 (heights 1, 3) in a 1 x 5 slice of space."""
+    kinds = [(1, d, h) for d in (1, 2, 3) for h in (1, 3)]
+    places = [(d, h, y) for _, d, h in kinds for y in range(5 - d + 1)]
+    pairs = list(itertools.product(places, repeat=2))
+    bins = state.empty(len(pairs), (1, 5, 9), max_boxes=3)
+    for k in range(2):
+        sides = torch.tensor([[1, p[k][0], p[k][1]] for p in pairs], dtype=torch.int16)
+        allowed = equilibrium(bins, Candidates(sides[:, None]))[:, 0, 0]
+        cell = torch.tensor([p[k][2] for p in pairs])
+        stands = allowed.gather(1, cell[:, None]).squeeze(1)
+        state.place(bins, torch.where(stands[:, None], sides, 0), cell)
+    for kind in kinds:
+        item = Candidates(torch.tensor(kind, dtype=torch.int16).expand(len(pairs), 1, 3))
+        exact = equilibrium(bins, item)
+        assert_order(bins, item)
+        for b in range(0, len(pairs), 7):
+            for y in range(5 - kind[1] + 1):
+                z = int(bins.heightmap[b, 0, y : y + kind[1]].max())
+                if z + kind[2] > 9:
+                    continue
+                stack = np.vstack((boxes_of(bins, b), [0, y, z, *kind]))
+                assert in_equilibrium(stack) == bool(exact[b, 0, 0, y])
+
+
+@pytest.mark.parametrize("rule", ["hull_alpha", "lbcp", "equilibrium"])
+def test_stacks_built_under_a_sound_rule_stand_as_a_whole(rule: str) -> None:
+    for size, sides in PLACES:
+        bins = random_play(make_rule(rule), 40, size, sides, 20, seed=11)
+        assert all(in_equilibrium(boxes_of(bins, b)) for b in range(40))
+
+
+def test_stacks_built_under_hull_1_often_do_not() -> None:
+    bins = random_play(hull_1, 100, (10, 10, 10), (2, 5), 20, seed=12)
+    share = np.mean([in_equilibrium(boxes_of(bins, b)) for b in range(100)])
+    assert 0.5 < share < 0.99
+
+
+@pytest.mark.parametrize("rule", ["hull_alpha", "lbcp", "equilibrium"])
+def test_sound_rules_hold_whatever_the_centre_of_mass_is_if_it_is_known(rule: str) -> None:
+    bound = make_rule(rule)
+    bins = state.empty(60, (8, 8, 30), max_boxes=15)
+    generator = torch.Generator().manual_seed(13)
+    for step in range(15):
+        item = off_centre(some_items(60, (1, 5), 100 + step), step)
+        item = Candidates(item.sides[:, :1], item.com[:, :1])  # type: ignore[index]
+        allowed = bound(bins, item)[:, 0].flatten(1)
+        cell = torch.multinomial(allowed.float() + 1e-12, 1, generator=generator)[:, 0]
+        stands = allowed.gather(1, cell[:, None])
+        state.place(bins, torch.where(stands, item.sides[:, 0], 0), cell, com=item.centres()[:, 0])
+    for b in range(60):
+        n = int(bins.count[b])
+        assert in_equilibrium(bins.boxes[b, :n].numpy(), bins.loads[b, :n].numpy())
+
+
+def test_hull_alpha_and_lbcp_hold_for_any_weights() -> None:
+    generator = np.random.default_rng(14)
+    for rule in (hull_alpha, lbcp):
+        bins = random_play(rule, 40, (8, 8, 20), (1, 5), 15, seed=15)
+        for b in range(40):
+            n = int(bins.count[b])
+            loads = bins.loads[b, :n].numpy().copy()
+            loads[:, 0] = 10 ** generator.uniform(-2, 2, n)
+            assert least_force(bins.boxes[b, :n].numpy(), loads) > 0
+
+
+# --- exact equilibrium against a library's solver -------------------------------------------------
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("rule", ["hull_alpha", "equilibrium"])
+def test_reduced_equilibrium_equals_the_whole_stacks_linear_program(
+    rule: str, weighted: bool
+) -> None:
+    bins = random_play(make_rule(rule), 60, (7, 7, 12), (1, 5), 16, seed=16)
+    items = some_items(60, (1, 5), 17)
+    weight = None
+    if weighted:
+        weight = (
+            torch.rand(60, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 99
+        )
+    item = candidates(items, weight)
+    exact, band = equilibrium(bins, item), hull_1(bins, item) & ~hull_alpha(bins, item)
+    checked, positive = 0, []
+    for b, a, x, y in band.nonzero().tolist()[:400]:
+        w, d, h = item.sides[b, a].tolist()
+        z = int(bins.heightmap[b, x : x + w, y : y + d].max())
+        n = int(bins.count[b])
+        boxes = np.vstack((bins.boxes[b, :n].numpy(), [x, y, z, w, d, h]))
+        load = [float(item.weights()[b]), x + w / 2, y + d / 2]
+        force = least_force(boxes, np.vstack((bins.loads[b, :n].numpy(), load)))
+        assert (force > STRICT) == bool(exact[b, a, x, y])
+        checked += 1
+        if force > STRICT:
+            positive.append(force)
+        else:
+            assert force < 1e-12  # nothing lies near the threshold
+    assert checked > 100
+    assert min(positive) > 1e3 * STRICT
+
+
+def test_equilibrium_with_a_margin_asks_for_every_place_of_the_centre() -> None:
+    bins = random_play(hull_alpha, 60, (7, 7, 12), (1, 5), 16, seed=18)
+    item = candidates(some_items(60, (1, 5), 19))
+    free, kept = equilibrium(bins, item), equilibrium(bins, item, margin=0.4)
+    assert not (kept & ~free).any()
+    assert kept.sum() < free.sum()
+    for dx, dy in ((0.4, 0), (-0.4, 0), (0, 0.4), (0, -0.4), (0.28, -0.28)):
+        moved = Candidates(item.sides, item.centres() + torch.tensor([dx, dy]))
+        assert not (kept & ~equilibrium(bins, moved)).any()
+
+
+# --- symmetry and independence --------------------------------------------------------------------
+
+
+def mirrored(bins: Bins) -> Bins:
+    """The bins with x turned round."""
+    boxes, loads = bins.boxes.clone(), bins.loads.clone()
+    width = bins.size[0]
+    boxes[..., 0] = width - boxes[..., 0] - boxes[..., 3]
+    loads[..., 1] = width - loads[..., 1]
+    maps = bins.heightmap.flip(1), bins.empty_map.flip(1)
+    return Bins(*maps, boxes, loads, bins.count, bins.filled, bins.height)
+
+
+def transposed(bins: Bins) -> Bins:
+    """The bins with x and y exchanged."""
+    boxes, loads = bins.boxes[..., [1, 0, 2, 4, 3, 5]], bins.loads[..., [0, 2, 1]]
+    maps = bins.heightmap.transpose(1, 2), bins.empty_map.transpose(1, 2)
+    return Bins(*(m.contiguous() for m in maps), boxes, loads, bins.count, bins.filled, bins.height)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_masks_follow_the_bins_symmetries(rule: str) -> None:
+    bound = make_rule(rule)
+    bins = random_play(hull_alpha, 30, (8, 6, 12), (1, 5), 14, seed=20)
+    item = candidates(some_items(30, (1, 5), 21))
+    mask = bound(bins, item)
+    turned = bound(mirrored(bins), item)
+    for b, a, x, y in mask.nonzero().tolist():
+        assert turned[b, a, 8 - x - int(item.sides[b, a, 0]), y]
+    assert mask.sum() == turned.sum()
+    # Exchanging x and y exchanges the orientations o and o ^ 1.
+    swapped = bound(transposed(bins), item)
+    assert torch.equal(swapped[:, [1, 0, 3, 2, 5, 4]].transpose(2, 3), mask)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_bins_mask_does_not_depend_on_the_others(rule: str) -> None:
+    bound = make_rule(rule)
+    bins = random_play(hull_alpha, 20, (10, 10, 10), (2, 5), 10, seed=22)
+    item = candidates(some_items(20, (2, 5), 23))
+    together = bound(bins, item)
+    for b in (0, 7, 19):
+        alone = torch.tensor([b])
+        assert torch.equal(bound(bins[alone], item[alone])[0], together[b])
+
+
+def test_candidates_with_a_zero_side_have_no_cell() -> None:
+    bins = random_play(hull_alpha, 8, (6, 6, 9), (1, 4), 6, seed=24)
+    for rule in RULES:
+        for axis in range(3):
+            sides = torch.full((8, 6, 3), 2, dtype=torch.int16)
+            sides[:, ::2, axis] = 0
+            mask = make_rule(rule)(bins, Candidates(sides))
+            assert not mask[:, ::2].any()
+            assert mask[:, 1::2].any()
