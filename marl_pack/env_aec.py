@@ -37,7 +37,6 @@ Version history: v0, first release.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -189,8 +188,8 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self.observation_spaces = {
             agent: planes
             if mask_in == "info"
-            else spaces.Dict(
-                {"observation": planes, "action_mask": spaces.Box(0, 1, (n,), np.int8)}
+            else spaces.Dict(  # pairs, since Gymnasium sorts the keys of a plain dict
+                [("observation", planes), ("action_mask", spaces.Box(0, 1, (n,), np.int8))]
             )
             for agent, n in choices.items()
         }
@@ -272,7 +271,8 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             self.render()
 
     def _place(self, cell: int) -> None:
-        outcome = self._game.place(torch.tensor([self._chosen]), torch.tensor([cell]))
+        choice = torch.tensor([[self._chosen], [cell]])
+        outcome = self._game.place(choice[0], choice[1], check=False)  # step has looked
         self._cycle += 1
         self._chosen = None
         self._read_game()
@@ -305,7 +305,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
     def _read_game(self) -> None:
         """Take this cycle's numbers out of the game."""
         self._packed = int(self._game.bins.count)
-        self._utilization = int(self._game.bins.filled) / math.prod(self._game.size)
+        self._utilization = int(self._game.bins.filled) / self._game.volume
         self._heights = self._game.bins.heightmap[0].numpy() / np.float32(self._unit)
         self._item = self._game.items[0].numpy()
         self._masks = self._game.mask[0].numpy()

@@ -39,10 +39,16 @@ class Oriented:
 class Outcome:
     """What placing an item brought."""
 
-    reward: Tensor  # float32 [N]        Eq. 5
-    done: Tensor  # bool [N]             whether the episode ended with this placement
-    utilization: Tensor  # float64 [N]   of the bin right after it, before any reset
-    placed: Tensor  # int64 [N]          boxes in the bin right after it
+    reward: Tensor  # float32 [N]   Eq. 5
+    done: Tensor  # bool [N]        whether the episode ended with this placement
+    filled: Tensor  # int64 [N]     cells filled in the bin right after it, before any reset
+    placed: Tensor  # int64 [N]     boxes in the bin right after it
+    volume: int  # of a bin, in cells
+
+    @property
+    def utilization(self) -> Tensor:
+        """Share of each bin's volume filled right after the placement, float64 [N]."""
+        return self.filled.double() / self.volume
 
 
 def orientations_with_a_cell(mask: Tensor) -> Tensor:
@@ -123,9 +129,9 @@ class Packing:
         self._index = torch.arange(n, device=self.device)
         self._banned = [o for o in ALL_ORIENTATIONS if o not in chosen]
         width, depth, height = self.size
-        volume = width * depth * height
-        self._gain, self._loss = self.alpha / volume, self.beta / volume
-        most = volume // self.stream.smallest
+        self.volume = width * depth * height
+        self._gain, self._loss = self.alpha / self.volume, self.beta / self.volume
+        most = self.volume // self.stream.smallest
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
         self.reset(seed, first_episode)
@@ -170,20 +176,21 @@ class Packing:
         """The items' sides along x, y, z, int16 [N, 3]."""
         return self.items.gather(1, state.orientation_table(self.device)[orientation])
 
-    def place(self, orientation: Tensor, cell: Tensor) -> Outcome:
+    def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
         """Second turn: set each item down, and bring the next one.
 
         Args:
             orientation: int64 [N], as in :meth:`orient`.
             cell: int64 [N], low corners ``x · D + y``.
+            check: whether to look if the choices are legal. Only a caller that has taken them from
+                the mask may do without: an illegal one would spoil the stack.
 
         Raises:
             ValueError: if a choice is not legal; nothing has changed then.
         """
         alive = self.alive
-        legal = self.mask.flatten(2)[self._index, orientation, cell]
-        if not bool(torch.equal(legal, alive) if self.auto_reset else (legal | ~alive).all()):
-            self._refuse(legal, orientation, cell)
+        if check:
+            self._check(orientation, cell)
         sides = self._turned(orientation)
         if not self.auto_reset:
             sides = torch.where(alive[:, None], sides, 0)
@@ -193,7 +200,7 @@ class Packing:
         _, waste = state.place(self.bins, sides, cell, self.weights, com)
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * sides.long().prod(1) - self._loss * waste).float()
-        utilization, placed = state.utilization(self.bins), self.bins.count.clone()
+        filled, placed = self.bins.filled.clone(), self.bins.count.clone()
 
         self.t += alive
         self.items, self.weights = self.stream.item(self.stream_state, self.t)
@@ -203,15 +210,18 @@ class Packing:
         done = alive & ~self.alive
         if self.auto_reset:
             self._begin(done.nonzero().squeeze(1))
-        return Outcome(reward, done, utilization, placed)
+        return Outcome(reward, done, filled, placed, self.volume)
 
-    def _refuse(self, legal: Tensor, orientation: Tensor, cell: Tensor) -> None:
-        i = int((~legal & self.alive).nonzero()[0])
-        x, y = divmod(int(cell[i]), self.size[1])
-        raise ValueError(
-            f"bin {i}: item {self.items[i].tolist()} in orientation {int(orientation[i])} may "
-            f"not be set down at ({x}, {y}); choose where the mask is true"
-        )
+    def _check(self, orientation: Tensor, cell: Tensor) -> None:
+        """Raise ValueError if a choice in a living bin is not legal."""
+        wrong = self.alive & ~self.mask.flatten(2)[self._index, orientation, cell]
+        if bool(wrong.any()):
+            i = int(wrong.nonzero()[0])
+            x, y = divmod(int(cell[i]), self.size[1])
+            raise ValueError(
+                f"bin {i}: item {self.items[i].tolist()} in orientation {int(orientation[i])} may "
+                f"not be set down at ({x}, {y}); choose where the mask is true"
+            )
 
     def _look(self) -> None:
         """Make the masks of the items that have come; a bin where none is legal has ended."""

@@ -79,7 +79,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
     count = int(game.bins.count)
     boxes, loads = game.bins.boxes[0, :count].numpy(), game.bins.loads[0, :count].numpy()
-    filled = int(game.bins.filled) / (game.size[0] * game.size[1] * game.size[2])
+    filled = int(game.bins.filled) / game.volume
     stands = "in strict equilibrium" if in_equilibrium(boxes, loads) else "NOT in equilibrium"
     ending = f"{count} boxes, utilization {filled:.1%}, {stands}"
     console.print(ending)

@@ -345,7 +345,7 @@ def test_the_raw_environment_refuses_an_illegal_action() -> None:
     env = env_aec.raw_env()
     env.reset(seed=0)
     env.step(0)
-    with pytest.raises(ValueError, match="placement_0: action .* is not legal"):
+    with pytest.raises(ValueError, match=r"placement_0: action .* is not legal"):
         env.step(first_illegal(env))
     with pytest.raises(ValueError, match="not in 0"):
         env.step(100)

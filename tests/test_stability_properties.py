@@ -98,7 +98,7 @@ def test_hull_masks_equal_the_reference_cell_by_cell(
     want = expected(bins, item, stands)
     assert (make_rule(bearing, margin=margin)(bins, item).numpy() == want).all()
     tensor = hull_torch.support_mask(
-        bins.heightmap, holds, item.sides, bins.height, item.com, margin
+        bins.heightmap, ~holds, item.sides, bins.height, item.com, margin
     )
     assert (tensor.numpy() == want).all()
 
@@ -142,14 +142,14 @@ def test_larger_maps_are_equal_on_cpu_and_tensor_code(size: tuple[int, int, int]
             for margin in (0.0, 1.3):
                 got = hull_cpu.support_mask(
                     bins.heightmap.numpy(),
-                    (bins.empty_map == 0).numpy(),
+                    bins.empty_map.numpy(),
                     item.sides.numpy(),
                     bins.height,
                     None if item.com is None else item.com.numpy(),
                     margin,
                 )
                 want = hull_torch.support_mask(
-                    bins.heightmap, bins.empty_map == 0, item.sides, bins.height, item.com, margin
+                    bins.heightmap, bins.empty_map, item.sides, bins.height, item.com, margin
                 )
                 assert (got == want.numpy()).all()
 
@@ -179,7 +179,6 @@ def test_any_pattern_of_contact_is_judged_as_the_reference_does(
 ) -> None:
     cells = np.array([bits >> k & 1 for k in range(36)], dtype=bool).reshape(6, 6)
     heights = torch.from_numpy(cells.astype(np.int16))[None]
-    bearing = torch.ones(1, 6, 6, dtype=torch.bool)
     item = Candidates(
         torch.tensor([[[6, 6, 1]]], dtype=torch.int16),
         torch.tensor([[[x, y]]], dtype=torch.float64),
@@ -192,7 +191,9 @@ def test_any_pattern_of_contact_is_judged_as_the_reference_does(
         return  # too close for floating point numbers to tell
     want = reference.supported(contact, (x, y), margin)
     assert bool(hull_1(bins, item, margin)[0, 0, 0, 0]) == want
-    tensor = hull_torch.support_mask(heights, bearing, item.sides, 5, item.com, margin)
+    tensor = hull_torch.support_mask(
+        heights, torch.zeros_like(heights), item.sides, 5, item.com, margin
+    )
     assert bool(tensor[0, 0, 0, 0]) == want
 
 

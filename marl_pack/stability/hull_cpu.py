@@ -239,9 +239,10 @@ def _runs(sides: Any, twin: Any, shape: tuple[int, int], height: int, size: int)
 
 
 @njit(cache=True)
-def _fill_levels(heights: Any, bearing: Any, levels: Any) -> None:
+def fill_levels(heights: Any, hollow: Any, levels: Any) -> None:
+    """K of every column, from flat maps."""
     for i in range(levels.size):
-        levels[i] = 2 * heights[i] + (1 if bearing[i] else 0)
+        levels[i] = 2 * heights[i] + (1 if hollow[i] == 0 else 0)
 
 
 @njit(cache=True)
@@ -270,12 +271,12 @@ def _write_mask(codes: Any, out: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def hull_mask(heightmap: Any, bearing: Any, sides: Any, height: int, levels: Any, out: Any) -> None:
+def hull_mask(heightmap: Any, hollow: Any, sides: Any, height: int, levels: Any, out: Any) -> None:
     """Masks of boxes with central mass and no margin; see :func:`hull_mask_general`.
 
     Args:
         heightmap: int16 [N, W, D].
-        bearing: bool [N, W, D], the columns whose top counts as support.
+        hollow: int16 [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3]; a candidate with a zero side gets an empty mask.
         height: H, at most 16383 cells (126 where ``levels`` is uint8).
         levels: uint8 or int16 [N, W, D], scratch.
@@ -287,9 +288,7 @@ def hull_mask(heightmap: Any, bearing: Any, sides: Any, height: int, levels: Any
     flat_sides = sides.reshape(n * ways, 3)
     flat_out = out.reshape(n * ways, cells)
     flat_levels = levels.reshape(n, cells)
-    _fill_levels(
-        heightmap.reshape(n * cells), bearing.reshape(n * cells), levels.reshape(n * cells)
-    )
+    fill_levels(heightmap.reshape(n * cells), hollow.reshape(n * cells), levels.reshape(n * cells))
 
     size = max(1, RUN_CELLS // cells)
     twin = _twins(sides)
@@ -345,7 +344,7 @@ def hull_mask(heightmap: Any, bearing: Any, sides: Any, height: int, levels: Any
 
 @njit(cache=True, nogil=True)
 def hull_mask_general(
-    heightmap: Any, bearing: Any, sides: Any, com: Any, margin: float, height: int, levels: Any,
+    heightmap: Any, hollow: Any, sides: Any, com: Any, margin: float, height: int, levels: Any,
     out: Any,
 ) -> None:  # fmt: skip
     """Masks for any centre of mass and safety margin.
@@ -357,13 +356,11 @@ def hull_mask_general(
     Args:
         com: float64 [N, A, 2], centre of mass from the window's low corner.
         margin: cells by which the support polygon is shrunk, ≥ 0.
-        heightmap, bearing, sides, height, levels, out: as in :func:`hull_mask`.
+        heightmap, hollow, sides, height, levels, out: as in :func:`hull_mask`.
     """
     n, width, depth = heightmap.shape
     cells = width * depth
-    _fill_levels(
-        heightmap.reshape(n * cells), bearing.reshape(n * cells), levels.reshape(n * cells)
-    )
+    fill_levels(heightmap.reshape(n * cells), hollow.reshape(n * cells), levels.reshape(n * cells))
     buffers = np.empty((2, cells), levels.dtype)
     whole = np.empty(cells, levels.dtype)
     codes = np.empty(cells, np.uint8)
@@ -412,7 +409,7 @@ def level_dtype(height: int) -> type[np.generic]:
 
 def support_mask(
     heightmap: NDArray[np.int16],
-    bearing: NDArray[np.bool_],
+    hollow: NDArray[np.int16],
     sides: NDArray[np.int16],
     height: int,
     com: NDArray[np.float64] | None = None,
@@ -422,20 +419,20 @@ def support_mask(
 
     Args:
         heightmap: int16 [N, W, D].
-        bearing: bool [N, W, D], the columns whose top counts as support.
+        hollow: int16 [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H.
         com: float64 [N, A, 2] from the window's low corner; the middle by default.
         margin: cells by which the support polygon is shrunk.
     """
     n, width, depth = heightmap.shape
-    heightmap, bearing = np.ascontiguousarray(heightmap), np.ascontiguousarray(bearing)
+    heightmap, hollow = np.ascontiguousarray(heightmap), np.ascontiguousarray(hollow)
     sides = np.ascontiguousarray(sides)
     out = np.empty((n, sides.shape[1], width, depth), np.uint8)
     levels = np.empty(heightmap.shape, level_dtype(height))
     if com is None and margin == 0:
-        hull_mask(heightmap, bearing, sides, height, levels, out)
+        hull_mask(heightmap, hollow, sides, height, levels, out)
     else:
         middle = np.ascontiguousarray(sides[..., :2] / 2 if com is None else com)
-        hull_mask_general(heightmap, bearing, sides, middle, margin, height, levels, out)
+        hull_mask_general(heightmap, hollow, sides, middle, margin, height, levels, out)
     return out.view(np.bool_)

@@ -140,7 +140,7 @@ def inside(contact: Tensor, com: Tensor, margin: float) -> Tensor:
 
 def support_mask(
     heightmap: Tensor,
-    bearing: Tensor,
+    hollow: Tensor,
     sides: Tensor,
     height: int,
     com: Tensor | None = None,
@@ -150,7 +150,7 @@ def support_mask(
 
     Args:
         heightmap: int16 [N, W, D].
-        bearing: bool [N, W, D], the columns whose top counts as support.
+        hollow: int [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H, at most 16383 cells.
         com: float64 [N, A, 2] from the window's low corner; the middle by default.
@@ -162,7 +162,7 @@ def support_mask(
     flat = sides.flatten(0, 1).long()
     middle = flat[:, :2].double() / 2 if com is None else com.flatten(0, 1)
     possible = fits(flat, width, depth)
-    level = (2 * heightmap + bearing.to(heightmap.dtype)).repeat_interleave(ways, 0)
+    level = (2 * heightmap + (hollow == 0).to(heightmap.dtype)).repeat_interleave(ways, 0)
 
     w, d = flat[:, 0].clamp(1, width), flat[:, 1].clamp(1, depth)
     low = torch.ceil(middle - margin).long()

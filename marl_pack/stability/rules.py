@@ -17,14 +17,14 @@ from marl_pack.stability.load_bearing import lbcp_bearing
 from marl_pack.stability.static_equilibrium import equilibrium_mask
 
 
-def _supported(bins: Bins, item: Candidates, bearing: Tensor, margin: float) -> Tensor:
+def _supported(bins: Bins, item: Candidates, hollow: Tensor, margin: float) -> Tensor:
     if bins.device.type != "cpu":
         return hull_torch.support_mask(
-            bins.heightmap, bearing, item.sides, bins.height, item.com, margin
+            bins.heightmap, hollow, item.sides, bins.height, item.com, margin
         )
     com = None if item.com is None else item.com.numpy()
     mask = hull_cpu.support_mask(
-        bins.heightmap.numpy(), bearing.numpy(), item.sides.numpy(), bins.height, com, margin
+        bins.heightmap.numpy(), hollow.numpy(), item.sides.numpy(), bins.height, com, margin
     )
     return torch.from_numpy(mask)
 
@@ -40,7 +40,7 @@ def hull_1(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
     Returns:
         Bool [N, A, W, D].
     """
-    return _supported(bins, item, torch.ones_like(bins.heightmap, dtype=torch.bool), margin)
+    return _supported(bins, item, torch.zeros_like(bins.heightmap), margin)
 
 
 def hull_alpha(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
@@ -49,7 +49,7 @@ def hull_alpha(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
     Sound for any masses and for whatever the rule places later: each weight goes straight down
     through solid columns. Arguments as :func:`hull_1`.
     """
-    return _supported(bins, item, bins.empty_map == 0, margin)
+    return _supported(bins, item, bins.empty_map, margin)
 
 
 def lbcp(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
@@ -57,7 +57,7 @@ def lbcp(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
 
     Arguments as :func:`hull_1`. The polygons are replayed from ``bins.boxes``.
     """
-    return _supported(bins, item, lbcp_bearing(bins), margin)
+    return _supported(bins, item, (~lbcp_bearing(bins)).to(torch.int16), margin)
 
 
 def area_ratio(

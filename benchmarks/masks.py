@@ -1,0 +1,147 @@
+"""How fast are masks? ``python -m benchmarks.masks``.
+
+1. One mask at 120 × 120 beside a literal reading of Algorithm 1: a loop over windows with
+   ``cv2.convexHull`` and ``cv2.pointPolygonTest``, once as the paper may be read (a point for each
+   cell) and once with the meaning that marl_pack gives it (the corners of the cell's square).
+2. Batched masks at 10 × 10, on every device.
+3. Cost against the grid's size.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.states import LARGE, SMALL, in_play, random_items
+from benchmarks.timing import best_time, devices, show
+from marl_pack.stability import RULES, Candidates, candidates, hull_alpha, hull_cpu, make_rule
+from marl_pack.stability.reference import corners
+
+
+def literal_algorithm_1(
+    heightmap: NDArray[np.int16],
+    empty_map: NDArray[np.int16],
+    item: tuple[int, int, int],
+    height: int,
+    squares: bool,
+) -> NDArray[np.bool_]:
+    """Algorithm 1, window by window, with OpenCV.
+
+    Args:
+        heightmap: [W, D].
+        empty_map: [W, D].
+        item: w, d, h.
+        height: H.
+        squares: whether the hull is that of the contact cells' squares (and inclusion strict), or
+            of the cells' indices as points (and the edge counts), as the paper may be read.
+    """
+    w, d, h = item
+    mask = np.zeros(heightmap.shape, np.bool_)
+    for x in range(heightmap.shape[0] - w + 1):
+        for y in range(heightmap.shape[1] - d + 1):
+            window = heightmap[x : x + w, y : y + d]
+            top = window.max()
+            if top + h > height:
+                continue
+            if top == 0:
+                mask[x, y] = True
+                continue
+            held = (window == top) & (empty_map[x : x + w, y : y + d] == 0)
+            if not held.any():
+                continue
+            if squares:
+                points, centre = 2 * corners(held), (float(w), float(d))
+            else:
+                points, centre = np.argwhere(held), (w / 2, d / 2)
+            hull = cv2.convexHull(points.astype(np.int32))
+            side = cv2.pointPolygonTest(hull, centre, False)
+            mask[x, y] = side > 0 if squares else side >= 0
+    return mask
+
+
+def against_the_literal_reading(states: int = 6) -> None:
+    """Figure 1."""
+    size, sides = LARGE
+    game = in_play(states, LARGE, steps=12)
+    items = random_items(states, sides)
+    heights, gaps = game.bins.heightmap.numpy(), game.bins.empty_map.numpy()
+    seconds = dict.fromkeys(("literal", "squares", "mask", "kernel", "levels"), 0.0)
+    for b in range(states):
+        one = torch.tensor([b])
+        bins, item = game.bins[one], Candidates(items[one][:, None])
+        sides_b = tuple(items[b].tolist())
+        inputs = (heights[b], gaps[b], sides_b, size[2])
+        exact = literal_algorithm_1(*inputs, squares=True)
+        assert (hull_alpha(bins, item)[0, 0].numpy() == exact).all()
+        seconds["literal"] += best_time(lambda i=inputs: literal_algorithm_1(*i, squares=False), 2)  # type: ignore[misc]  # bound now
+        seconds["squares"] += best_time(lambda i=inputs: literal_algorithm_1(*i, squares=True), 2)  # type: ignore[misc]  # bound now
+        seconds["mask"] += best_time(lambda b=bins, i=item: hull_alpha(b, i))  # type: ignore[misc]  # bound now
+        levels = np.empty((1, *size[:2]), hull_cpu.level_dtype(size[2]))
+        out = np.empty((1, 1, *size[:2]), np.uint8)
+        maps = bins.heightmap.numpy(), bins.empty_map.numpy()
+        arguments = (*maps, item.sides.numpy(), size[2], levels, out)
+        seconds["kernel"] += best_time(lambda a=arguments: hull_cpu.hull_mask(*a))  # type: ignore[misc]  # bound now
+        flat = (*(m.ravel() for m in maps), levels.ravel())
+        seconds["levels"] += best_time(lambda a=flat: hull_cpu.fill_levels(*a))  # type: ignore[misc]  # bound now
+    mean = {name: value / states for name, value in seconds.items()}
+    mean["alone"] = mean["kernel"] - mean["levels"]
+    rows = [
+        [what, f"{1e6 * mean[name]:,.1f}", f"{mean['literal'] / mean[name]:,.0f}"]
+        for what, name in (
+            ("literal Algorithm 1, cells as points (OpenCV)", "literal"),
+            ("literal Algorithm 1, cells as squares (OpenCV)", "squares"),
+            ("hull_alpha, prepared once a placement", "alone"),
+            ("hull_alpha, preparation included", "kernel"),
+            ("hull_alpha, preparation and Python call included", "mask"),
+        )
+    ]
+    show(
+        f"one mask, bin {size[0]} × {size[1]}, sides {sides[0]}–{sides[1]}, {states} states",
+        ["", "µs a mask", "times faster"],
+        rows,
+    )
+
+
+def batched(n: int = 1024) -> None:
+    """Figure 2."""
+    rows = []
+    for device in devices():
+        game = in_play(n, SMALL, device=device)
+        item = game.candidates(game.items, game.weights)
+        for name in RULES:
+            rule = make_rule(name)
+            seconds = best_time(
+                lambda r=rule, g=game, i=item: r(g.bins, i),  # type: ignore[misc]  # bound now
+                5,
+                device,
+            )
+            rows.append([name, device, f"{6 * n / seconds / 1e6:,.3f}"])
+    show(f"{n:,} bins × 6 orientations, 10 × 10 × 10", ["rule", "device", "million masks/s"], rows)
+
+
+def scaling() -> None:
+    """Figure 3: the items grow with the bin, from its 5th to half of it."""
+    rows = []
+    for side in (10, 20, 40, 80, 160):
+        place = ((side, side, side), (side // 5, side // 2))
+        n = max(8, 4096 * 100 // side**2)
+        game = in_play(n, place, steps=20)
+        item = candidates(game.items)
+        seconds = best_time(lambda g=game, i=item: hull_alpha(g.bins, i), 5)  # type: ignore[misc]  # bound now
+        each = seconds / (6 * n)
+        rows.append([f"{side} × {side}", f"{1e6 * each:.3f}", f"{1e9 * each / side**2:.2f}"])
+    show("hull_alpha against the grid", ["grid", "µs a mask", "ns a cell"], rows)
+
+
+def main() -> None:
+    """All figures."""
+    torch.set_num_threads(1)
+    against_the_literal_reading()
+    batched()
+    scaling()
+
+
+if __name__ == "__main__":
+    main()
