@@ -32,6 +32,7 @@ train: play  ## the main job
 
 benchmark: $(STAMP)  ## every figure of docs/results.md on speed
 	$(BIN)/python -m benchmarks.masks
+	$(BIN)/python -m benchmarks.rules
 	$(BIN)/python -m benchmarks.game
 
 clean:  ## forget compiled code and caches

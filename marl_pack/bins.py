@@ -161,7 +161,7 @@ def place(
     cells: Tensor,
     weights: Tensor | None = None,
     com: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Set one box into each bin from above, in place (Algorithm 2 for the empty map).
 
     The box comes to rest on the highest column of its footprint. No rule is asked: the caller
@@ -175,8 +175,8 @@ def place(
         com: float [N, 2], centre of mass from the low corner; the footprint's centre by default.
 
     Returns:
-        Resting heights int16 [N] and wasted cells int64 [N] (empty cells enclosed below the box);
-        0 where nothing was placed.
+        Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
+        volumes int64 [N]; 0 where nothing was placed.
     """
     if bins.device.type == "cpu":
         return _place_cpu(bins, sides, cells, weights, com)
@@ -186,12 +186,12 @@ def place(
 @njit(cache=True, nogil=True)
 def _place_each(
     heightmap: Any, empty_map: Any, boxes: Any, loads: Any, count: Any, filled: Any, sides: Any,
-    cells: Any, weights: Any, com: Any, rest: Any, waste: Any,
+    cells: Any, weights: Any, com: Any, rest: Any, waste: Any, volume: Any,
 ) -> None:  # fmt: skip
     depth = heightmap.shape[2]
     for b in range(heightmap.shape[0]):
         w, d, h = sides[b, 0], sides[b, 1], sides[b, 2]
-        rest[b], waste[b] = 0, 0
+        rest[b], waste[b], volume[b] = 0, 0, 0
         if w < 1 or d < 1 or h < 1:
             continue
         x, y = cells[b] // depth, cells[b] % depth
@@ -213,14 +213,15 @@ def _place_each(
         load[1] = x + (com[b, 0] if com.size else w / 2)
         load[2] = y + (com[b, 1] if com.size else d / 2)
         count[b] += 1
-        filled[b] += np.int64(w) * d * h
+        volume[b] = np.int64(w) * d * h
+        filled[b] += volume[b]
 
 
 def _place_cpu(
     bins: Bins, sides: Tensor, cells: Tensor, weights: Tensor | None, com: Tensor | None
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     rest = torch.empty(len(bins), dtype=torch.int16)
-    waste = torch.empty(len(bins), dtype=torch.int64)
+    waste, volume = torch.empty(2, len(bins), dtype=torch.int64)
     _place_each(
         *(tensor.numpy() for tensor in bins.tensors()),
         sides.numpy(),
@@ -229,13 +230,14 @@ def _place_cpu(
         np.empty((0, 2)) if com is None else com.double().numpy(),
         rest.numpy(),
         waste.numpy(),
+        volume.numpy(),
     )
-    return rest, waste
+    return rest, waste, volume
 
 
 def _place_torch(
     bins: Bins, sides: Tensor, cells: Tensor, weights: Tensor | None, com: Tensor | None
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     volume = sides.long().prod(1)
     real = volume > 0
     sides = torch.where(real[:, None], sides, 0)
@@ -259,7 +261,7 @@ def _place_torch(
         table[index, slot] = torch.where(real[:, None], row, table[index, slot])
     bins.count.add_(real)
     bins.filled.add_(volume)
-    return rest, gap.flatten(1).sum(1)
+    return rest, gap.flatten(1).sum(1), volume
 
 
 def utilization(bins: Bins) -> Tensor:

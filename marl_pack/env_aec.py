@@ -122,6 +122,9 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; raises here);
             ``"repair"``: the nearest legal one is played and the actor's info says so.
 
+    Attributes:
+        utilization: share of the bin filled, in [0, 1].
+
     Raises:
         ValueError: if an argument cannot be, naming what would be right.
     """
@@ -173,11 +176,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         }  # fmt: skip
         self._stream_game = Packing(1, items=items, **self._arguments)
         self._game = self._stream_game
+        self._unit = max(self._game.size)
         self._episode = -1
         self._seeded = False
+        self._read_game()
 
         width, depth, _ = self._game.size
-        self._unit = max(self._game.size)
         choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: width * depth}
         if pad_actions:
             choices = dict.fromkeys(AGENTS, max(choices.values()))
@@ -194,6 +198,8 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             for agent, n in choices.items()
         }
         self.state_space = spaces.Box(0.0, 1.0, (5, width, depth), np.float32)
+        self._orientation_played = np.zeros(1, np.int64)
+        self._cell_played = np.zeros(1, np.int64)
         self._window: Any = None
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -271,8 +277,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             self.render()
 
     def _place(self, cell: int) -> None:
-        choice = torch.tensor([[self._chosen], [cell]])
-        outcome = self._game.place(choice[0], choice[1], check=False)  # step has looked
+        self._orientation_played[0], self._cell_played[0] = self._chosen, cell
+        outcome = self._game.place(  # step has looked whether it is legal
+            torch.from_numpy(self._orientation_played),
+            torch.from_numpy(self._cell_played),
+            check=False,
+        )
         self._cycle += 1
         self._chosen = None
         self._read_game()
@@ -304,12 +314,13 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     def _read_game(self) -> None:
         """Take this cycle's numbers out of the game."""
-        self._packed = int(self._game.bins.count)
-        self._utilization = int(self._game.bins.filled) / self._game.volume
-        self._heights = self._game.bins.heightmap[0].numpy() / np.float32(self._unit)
-        self._item = self._game.items[0].numpy()
-        self._masks = self._game.mask[0].numpy()
-        self._orientation_mask = self._game.orientation_mask[0].numpy()
+        game = self._game
+        self._packed = int(game.bins.count.numpy()[0])
+        self.utilization = int(game.bins.filled.numpy()[0]) / game.volume
+        self._heights = game.bins.heightmap.numpy()[0] / np.float32(self._unit)
+        self._item = game.items.numpy()[0]
+        self._masks = game.mask.numpy()[0]
+        self._orientation_mask = game.orientation_mask.numpy()[0]
 
     def _sides(self, turned: bool) -> NDArray[np.int16]:
         """The item's sides: its own, or along x, y, z once (and if) it is turned."""
@@ -335,7 +346,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return mask
 
     def _info(self, agent: str) -> dict[str, Any]:
-        info: dict[str, Any] = {"utilization": self._utilization, "packed": self._packed}
+        info: dict[str, Any] = {"utilization": self.utilization, "packed": self._packed}
         if self.mask_in == "info":
             info["action_mask"] = self._mask(agent)
         return info
@@ -375,7 +386,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return None
 
     def _title(self) -> str:
-        return f"{self._packed} boxes, utilization {self._utilization:.1%}"
+        return f"{self._packed} boxes, utilization {self.utilization:.1%}"
 
     def _text(self) -> str:
         sides = " x ".join(map(str, self._sides(turned=True)))

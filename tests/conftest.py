@@ -25,7 +25,7 @@ def stack(size: tuple[int, int, int], *boxes: tuple[int, int, int, int, int, int
     """One bin with boxes x, y, z, w, d, h set into it; fails if one does not rest at its z."""
     bins = state.empty(1, size, max_boxes=len(boxes) + 1)
     for x, y, z, w, d, h in boxes:
-        rest, _ = state.place(
+        rest, *_ = state.place(
             bins, torch.tensor([[w, d, h]], dtype=torch.int16), torch.tensor([x * size[1] + y])
         )
         assert int(rest) == z, f"box {(x, y, z, w, d, h)} rests at {int(rest)}"

@@ -26,10 +26,11 @@ def test_gaps_under_gaps_add_up() -> None:
 
 def test_place_tells_resting_height_and_waste() -> None:
     bins = stack((6, 6, 9), (0, 0, 0, 3, 3, 4))
-    rest, waste = state.place(
+    rest, waste, volume = state.place(
         bins, torch.tensor([[4, 2, 1]], dtype=torch.int16), torch.tensor([1 * 6 + 2])
     )
     assert int(rest) == 4
+    assert int(volume) == 8
     assert int(waste) == 8 * 4 - 2 * 4  # 8 columns, of which x = 1, 2 at y = 2 are filled
 
 
