@@ -264,10 +264,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         choice, repaired = self._legal(agent, action)
         self._cumulative_rewards[agent] = 0.0
         self._clear_rewards()
-        if agent == ORIENTATION:
+        if self._chosen is None:
             self._chosen = choice
         else:
-            self._place(choice)
+            self._place(self._chosen, choice)
         self.agent_selection = PLACEMENT if agent == ORIENTATION else ORIENTATION
         self._accumulate_rewards()
         self.infos = {name: self._info(name) for name in self.agents}
@@ -276,8 +276,8 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         if self.render_mode == "human":
             self.render()
 
-    def _place(self, cell: int) -> None:
-        self._orientation_played[0], self._cell_played[0] = self._chosen, cell
+    def _place(self, orientation: int, cell: int) -> None:
+        self._orientation_played[0], self._cell_played[0] = orientation, cell
         outcome = self._game.place(  # step has looked whether it is legal
             torch.from_numpy(self._orientation_played),
             torch.from_numpy(self._cell_played),
