@@ -65,28 +65,35 @@ def resting_height(heightmap: Tensor, sides: Tensor) -> Tensor:
 
 
 def _below_chain(points: Tensor, present: Tensor, com: Tensor, margin: float) -> Tensor:
-    """Whether ``com`` lies below the upper chain of each hull by more than ``margin``.
+    """Whether ``com`` lies strictly below the upper chain of each hull, by ``margin``.
 
-    An edge of the chain is a pair of points that no other point lies above.
+    The chain at x is the highest of the lines between a point left and a point right of x, so
+    without a margin one such line above ``com`` is enough. With one, ``com`` is measured against
+    every edge: a pair of points that no other point lies above.
 
     Args:
         points: float64 [U, P], height of the hull's boundary points over x = 0 … P - 1.
-        present: bool [U, P], which of them exist. com: float64 [U, 2].
+        present: bool [U, P], which of them exist.
+        com: float64 [U, 2].
+        margin: in cells.
     """
     size = points.shape[1]
     x = torch.arange(size, dtype=torch.float64, device=points.device)
     ex = x[None, :] - x[:, None]  # [i, j]
     ey = points[:, None, :] - points[:, :, None]  # [U, i, j]
     pair = present[:, :, None] & present[:, None, :] & (ex > 0)
-    # cross of (edge i → j) with (i → k): positive where k lies above the edge's line
+    # cross of (i → j) with (i → com): negative where com lies below the line
+    run, rise = com[:, 0, None] - x, com[:, 1, None] - points
+    cross = ex * rise[:, :, None] - ey * run[:, :, None]
+    if margin == 0:
+        around = (run >= 0)[:, :, None] & (run <= 0)[:, None, :]
+        return (pair & around & (cross < 0)).flatten(1).any(1)
+    # cross of (i → j) with (i → k): positive where k lies above the line
     above = (
         ex[None, :, :, None] * (points[:, None, None, :] - points[:, :, None, None])
         - ey[..., None] * (x - x[:, None])[None, :, None, :]
     )
     edge = pair & ~((above > 0) & present[:, None, None, :]).any(-1)
-    cross = ex * (com[:, 1, None, None] - points[:, :, None]) - ey * (
-        com[:, 0, None, None] - x[None, :, None]
-    )
     clear = (cross < 0) & (-cross > margin * torch.sqrt(ex * ex + ey * ey))
     return (clear | ~edge).flatten(1).all(1)
 
@@ -130,7 +137,7 @@ def inside(contact: Tensor, com: Tensor, margin: float) -> Tensor:
     right = torch.where(present, x, -torch.inf).amax(1)
     result = (com[:, 0] - left > margin) & (right - com[:, 0] > margin)
     mirrored = com * torch.tensor([1.0, -1.0], dtype=torch.float64, device=com.device)
-    chunk = max(1, PAIR_CELLS // (w + 1) ** 3)
+    chunk = max(1, PAIR_CELLS // (w + 1) ** (2 if margin == 0 else 3))
     for start in range(0, count, chunk):
         part = slice(start, start + chunk)
         for points, point in ((upper, com), (lower, mirrored)):
@@ -170,29 +177,37 @@ def support_mask(
     lows_w, lows_d = low[:, 0].clamp(min=1), low[:, 1].clamp(min=1)
     high_w, high_d = (w - start[:, 0]).clamp(min=1), (d - start[:, 1]).clamp(min=1)
     room = (low > 0).all(1) & (start < flat[:, :2]).all(1)
-    zero = torch.zeros_like(w)
 
-    best = slide(level, w, d)
+    # With a central mass and no margin all four quadrants have one size.
+    quarter = slide(level, lows_w, lows_d) if com is None and margin == 0 else None
+
+    def largest(
+        x_part: tuple[Tensor, Tensor | None], y_part: tuple[Tensor, Tensor | None]
+    ) -> Tensor:
+        """The largest K in a part of each window, given as its extent and offset in x and y."""
+        (pw, sx), (pd, sy) = x_part, y_part
+        part = slide(level, pw, pd) if quarter is None else quarter
+        part = part if sx is None else _shift(part, sx, 1)
+        return part if sy is None else _shift(part, sy, 2)
+
+    x_parts = (lows_w, None), (high_w, w - high_w)
+    y_parts = (lows_d, None), (high_d, d - high_d)
+    a, b, c, e = (largest(x_part, y_part) for x_part in x_parts for y_part in y_parts)
+    if margin == 0:  # the quadrants cover the window
+        halves = torch.maximum(a, b), torch.maximum(c, e), torch.maximum(a, c), torch.maximum(b, e)
+        best = torch.maximum(halves[0], halves[1])
+    else:
+        best = slide(level, w, d)
+        halves = (
+            largest(x_parts[0], (d, None)), largest(x_parts[1], (d, None)),
+            largest((w, None), y_parts[0]), largest((w, None), y_parts[1]),
+        )  # fmt: skip
     limit = 2 * (height - flat[:, 2, None, None]) + 1
     possible &= room[:, None, None] & (best % 2 == 1) & (best <= limit)
-
-    def reaches(pw: Tensor, pd: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
-        part = _shift(_shift(slide(level, pw, pd), sx, 1), sy, 2)
-        return part == best
-
-    x0, x1 = (lows_w, zero), (high_w, w - high_w)  # width and offset of the low and high part
-    y0, y1 = (lows_d, zero), (high_d, d - high_d)
-    quadrants = [reaches(px, py, sx, sy) for px, sx in (x0, x1) for py, sy in (y0, y1)]
-    if margin == 0:
-        a, b, c, e = quadrants
-        halves = (a | b) & (c | e) & (a | c) & (b | e)
-    else:
-        halves = (
-            reaches(x0[0], d, zero, zero) & reaches(x1[0], d, x1[1], zero)
-            & reaches(w, y0[0], zero, zero) & reaches(w, y1[0], zero, y1[1])
-        )  # fmt: skip
-    mask = possible & quadrants[0] & quadrants[1] & quadrants[2] & quadrants[3]
-    index, x, y = torch.nonzero(possible & halves & ~mask, as_tuple=True)
+    mask = possible & (torch.minimum(torch.minimum(a, b), torch.minimum(c, e)) == best)
+    for half in halves:
+        possible &= half == best
+    index, x, y = torch.nonzero(possible & ~mask, as_tuple=True)
     if index.numel():
         window, member = windows(level, index, x, y, flat[index])
         contact = member & (window == best[index, x, y][:, None, None])
