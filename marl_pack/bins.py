@@ -133,6 +133,14 @@ def clear(bins: Bins, which: Tensor | slice) -> None:
         tensor[which] = 0
 
 
+def compiled(device: torch.device) -> bool:
+    """Whether tensors on ``device`` are handed to compiled loops; elsewhere tensor code does it.
+
+    The one switch between the two codes. Both give the same results.
+    """
+    return device.type == "cpu"
+
+
 @cache
 def orientation_table(device: torch.device) -> Tensor:
     """:data:`ORIENTATIONS` as int64 [6, 3] on ``device``."""
@@ -178,7 +186,7 @@ def place(
         Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
         volumes int64 [N]; 0 where nothing was placed.
     """
-    if bins.device.type == "cpu":
+    if compiled(bins.device):
         return _place_cpu(bins, sides, cells, weights, com)
     return _place_torch(bins, sides, cells, weights, com)
 

@@ -22,6 +22,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from marl_pack import bins
 from marl_pack.bins import check_size
 
 Size = tuple[int, int, int]
@@ -139,7 +140,7 @@ class Uniform:
     def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Sides int16 [N, 3] and weights float64 [N]."""
         kinds = self.high - self.low + 1
-        if state.device.type == "cpu":
+        if bins.compiled(state.device):
             out = np.empty((len(state), 3), np.int16), np.empty(len(state))
             _uniform_items(state.numpy(), t.numpy(), self.low, kinds, *out)
             return torch.from_numpy(out[0]), torch.from_numpy(out[1])

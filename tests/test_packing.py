@@ -3,6 +3,7 @@ import pytest
 import torch
 from conftest import boxes_of
 
+from marl_pack import bins as state
 from marl_pack.agents.heuristics import HEURISTICS, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.bins import ORIENTATIONS
@@ -109,8 +110,28 @@ def test_auto_reset_goes_on_with_the_next_episode_of_each_bin() -> None:
     assert (game.episode % 8 == torch.arange(8)).all()
     # Episode 8 of bin 0 is episode 8 of the stream.
     other = Packing(1, seed=5, first_episode=int(game.episode[0]))
-    state = game.stream.start(5, game.episode[:1])
-    assert torch.equal(other.items, game.stream.item(state, torch.tensor([0]))[0])
+    begun = game.stream.start(5, game.episode[:1])
+    assert torch.equal(other.items, game.stream.item(begun, torch.tensor([0]))[0])
+
+
+@pytest.mark.parametrize("items", ["rs", "cut1"])
+@pytest.mark.parametrize("rule", RULES)
+def test_the_whole_game_is_the_same_in_tensor_code(
+    rule: str, items: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def played() -> tuple[Packing, list[list[float]]]:
+        game = Packing(12, (8, 6, 9), items, sides=(2, 4), rule=rule, seed=3)
+        policy = make_policy("random", 4)
+        return game, [game.place(*policy(game)).reward.tolist() for _ in range(25)]
+
+    loops, rewards = played()
+    monkeypatch.setattr(state, "compiled", lambda device: False)
+    tensors, same = played()
+    assert rewards == same
+    assert torch.equal(loops.mask, tensors.mask)
+    assert torch.equal(loops.items, tensors.items)
+    for now, then in zip(loops.bins.tensors()[:2], tensors.bins.tensors()[:2], strict=True):
+        assert torch.equal(now, then)
 
 
 def test_orienting_changes_nothing() -> None:

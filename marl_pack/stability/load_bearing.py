@@ -14,6 +14,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from marl_pack import bins as state
 from marl_pack.bins import Bins, footprint
 from marl_pack.stability.hull_cpu import envelope
 from marl_pack.stability.hull_torch import PAIR_CELLS, boundary, windows
@@ -125,7 +126,7 @@ def _rounded(points: Tensor, present: Tensor) -> Tensor:
 
 def lbcp_bearing(bins: Bins) -> Tensor:
     """Bool [N, W, D]: the columns whose top carries any load, replayed from the placed boxes."""
-    if bins.device.type != "cpu":
+    if not state.compiled(bins.device):
         return _bearing_torch(bins)
     out = np.empty(tuple(bins.heightmap.shape), np.bool_)
     _bearing_cpu(bins.boxes.contiguous().numpy(), bins.count.numpy(), out)

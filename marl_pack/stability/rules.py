@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from marl_pack import bins as state
 from marl_pack.bins import Bins
 from marl_pack.stability import hull_cpu, hull_torch, support_area
 from marl_pack.stability.candidates import Candidates, Rule
@@ -18,7 +19,7 @@ from marl_pack.stability.static_equilibrium import equilibrium_mask
 
 
 def _supported(bins: Bins, item: Candidates, hollow: Tensor, margin: float) -> Tensor:
-    if bins.device.type != "cpu":
+    if not state.compiled(bins.device):
         return hull_torch.support_mask(
             bins.heightmap, hollow, item.sides, bins.height, item.com, margin
         )
@@ -72,7 +73,7 @@ def area_ratio(
             the authors' code has it), or pairs (share, corners); shares must be exceeded.
     """
     pairs = support_area.check_thresholds(thresholds)
-    if bins.device.type != "cpu":
+    if not state.compiled(bins.device):
         return support_area.mask_torch(bins.heightmap, item.sides, bins.height, pairs)
     mask = support_area.mask_cpu(bins.heightmap.numpy(), item.sides.numpy(), bins.height, pairs)
     return torch.from_numpy(mask)
