@@ -17,16 +17,21 @@ from marl_pack.packing import Packing
 from marl_pack.stability.hull_torch import resting_height
 
 
-def _window_sum(heightmap: Tensor, sides: Tensor) -> Tensor:
-    """Sum of the heights under every window, int64 [N, A, W, D], by a summed-area table."""
+def _window_sum(heightmap: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Sum of the heights under every w × d window, int64 [N, A, W, D], by a summed-area table.
+
+    Args:
+        heightmap: int16 [N, W, D].
+        w: int64 [N, A, 1, 1].
+        d: int64 [N, A, 1, 1].
+    """
     n, width, depth = heightmap.shape
     table = torch.zeros(n, width + 1, depth + 1, dtype=torch.int64, device=heightmap.device)
     table[:, 1:, 1:] = heightmap.long().cumsum(1).cumsum(2)
     x = torch.arange(width, device=heightmap.device)
     y = torch.arange(depth, device=heightmap.device)
-    far_x = (x + sides[..., :1].long()).clamp(max=width)[..., :, None]  # [N, A, W, 1]
-    far_y = (y + sides[..., 1:2].long()).clamp(max=depth)[..., None, :]  # [N, A, 1, D]
     x, y = x[:, None], y[None, :]
+    far_x, far_y = (x + w).clamp(max=width), (y + d).clamp(max=depth)  # [N, A, W, 1], [N, A, 1, D]
     b = torch.arange(n, device=heightmap.device)[:, None, None, None]
     return table[b, far_x, far_y] - table[b, x, far_y] - table[b, far_x, y] + table[b, x, y]
 
@@ -41,7 +46,6 @@ class View:
     x: Tensor  # int64 [W, 1]         low corner
     y: Tensor  # int64 [1, D]
     z: Tensor  # int64 [N, 6, W, D]   resting height
-    waste: Tensor  # int64 [N, 6, W, D]   empty cells enclosed below the item
     size: tuple[int, int, int]
 
 
@@ -49,10 +53,15 @@ def _view(game: Packing) -> View:
     sides = game.candidates(game.items, game.weights).sides
     w, d, h = (sides[..., k, None, None].long() for k in range(3))
     z = resting_height(game.bins.heightmap, sides).long()
-    waste = (w * d * z - _window_sum(game.bins.heightmap, sides)).clamp(min=0)
     x = torch.arange(game.size[0], device=game.device)[:, None]
     y = torch.arange(game.size[1], device=game.device)[None, :]
-    return View(w, d, h, x, y, z, waste, game.size)
+    return View(w, d, h, x, y, z, game.size)
+
+
+def _waste(game: Packing, v: View) -> Tensor:
+    """Empty cells enclosed below the item, int64 [N, 6, W, D]; 0 where it does not fit."""
+    below = _window_sum(game.bins.heightmap, v.w, v.d)
+    return (v.w * v.d * v.z - below).clamp(min=0)
 
 
 def _least(game: Packing, *keys: tuple[Tensor, int]) -> tuple[Tensor, Tensor]:
@@ -85,7 +94,7 @@ def height_min(game: Packing) -> tuple[Tensor, Tensor]:
     """
     v = _view(game)
     width, depth, height = v.size
-    return _least(game, (v.waste, width * depth * height), (v.x + v.y, width + depth))
+    return _least(game, (_waste(game, v), width * depth * height), (v.x + v.y, width + depth))
 
 
 def best_fit(game: Packing) -> tuple[Tensor, Tensor]:
@@ -94,7 +103,7 @@ def best_fit(game: Packing) -> tuple[Tensor, Tensor]:
     width, depth, height = v.size
     return _least(
         game,
-        (v.waste, width * depth * height),
+        (_waste(game, v), width * depth * height),
         ((v.z + v.h).clamp(max=height), height + 1),
         (v.x + v.y, width + depth),
     )
