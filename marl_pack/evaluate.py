@@ -134,8 +134,8 @@ def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, float | li
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
     """Print the table, a row for each policy."""
     table = Table(title=title)
-    table.add_column("policy")
-    for column in ("episodes", "utilization %", "std", "items", "decisions/s", "strict"):
+    table.add_column("policy", no_wrap=True)
+    for column in ("episodes", "utilization %", "std", "items", "dec./s", "strict"):
         table.add_column(column, justify="right", no_wrap=True)
     for name, row in rows.items():
         half = (row["interval"][1] - row["interval"][0]) / 2
@@ -150,7 +150,8 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         )
     console.print(table)
     console.print(
-        "±: 95 % interval of the mean; strict: final stacks in strict equilibrium as a whole"
+        "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
+        "strict: final stacks in strict equilibrium as a whole"
     )
 
 
