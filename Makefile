@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup test check play train benchmark clean
+.PHONY: help setup test check bounds play train benchmark clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -24,6 +24,11 @@ test: $(STAMP)  ## style, types and tests
 	$(BIN)/python -m pytest -n 2
 
 check: test
+
+bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
+	  tests/test_items.py tests/test_packing.py tests/test_stability_rules.py \
+	  tests/test_stability_properties.py
 
 play: $(STAMP)  ## one game by a heuristic, shown and drawn
 	$(BIN)/python -m marl_pack.play --policy dblf --seed 0 --picture play.png

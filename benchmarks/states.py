@@ -24,16 +24,10 @@ def in_play(
     """N bins in the middle of their games, at all stages."""
     size, sides = place
     game = Packing(n, size, sides=sides, rule=rule, device=device, seed=1)
-    player = make_policy(policy, 1) if device == "cpu" or policy != "random" else _on(device)
+    player = make_policy(policy, 1, device)
     for _ in range(steps):
         game.place(*player(game))
     return game
-
-
-def _on(device: str):  # type: ignore[no-untyped-def]
-    from marl_pack.agents.heuristics import random_policy
-
-    return random_policy(1, device)
 
 
 def random_items(n: int, sides: tuple[int, int], device: str = "cpu") -> torch.Tensor:

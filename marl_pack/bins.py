@@ -7,9 +7,11 @@ orientations of an item).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,8 @@ it comes and {0, 1} are the two orientations that keep it upright."""
 
 MAX_HEIGHT = 16383
 """Tallest bin in cells: masks compare ``2 · height + 1`` as 16-bit integers."""
+MAX_SIDE = 32767
+"""Widest and deepest bin in cells."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +86,25 @@ class Bins:
         )  # fmt: skip
 
 
+def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    return math.isfinite(float(value))
+
+
 def check_size(size: tuple[int, int, int]) -> tuple[int, int, int]:
     """Return ``size`` as three ints.
 
     Raises:
-        ValueError: unless it is three whole numbers ≥ 1 with a height ≤ :data:`MAX_HEIGHT`.
+        ValueError: unless it is three whole numbers from 1 to the largest allowed.
     """
-    sides = tuple(size)
-    if len(sides) != 3 or any(int(s) != s or s < 1 for s in sides):
+    sides = tuple(size) if isinstance(size, Iterable) else ()
+    if len(sides) != 3 or any(not _is_number(s) or int(s) != s or s < 1 for s in sides):
         raise ValueError(f"bin size {size!r}: needs three whole numbers of cells ≥ 1, W D H")
-    if sides[2] > MAX_HEIGHT:
-        raise ValueError(f"bin height {sides[2]}: at most {MAX_HEIGHT} cells; use larger cells")
+    if sides[2] > MAX_HEIGHT or max(sides) > MAX_SIDE:
+        raise ValueError(
+            f"bin size {size!r}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger cells"
+        )
     return int(sides[0]), int(sides[1]), int(sides[2])
 
 
@@ -152,12 +164,11 @@ def oriented(items: Tensor) -> Tensor:
     return items[..., orientation_table(items.device)]
 
 
-def footprint(bins: Bins, sides: Tensor, cells: Tensor) -> Tensor:
-    """Bool [N, W, D]: the columns under boxes of ``sides`` [N, 3] placed at ``cells`` [N]."""
-    w, d, _ = bins.size
+def footprint(w: int, d: int, sides: Tensor, cells: Tensor) -> Tensor:
+    """Bool [N, w, d]: the columns under boxes of ``sides`` [N, 3] placed at ``cells`` [N]."""
     x, y = cells // d, cells % d
-    rows = torch.arange(w, device=bins.device)
-    columns = torch.arange(d, device=bins.device)
+    rows = torch.arange(w, device=sides.device)
+    columns = torch.arange(d, device=sides.device)
     in_x = (rows >= x[:, None]) & (rows < (x + sides[:, 0])[:, None])
     in_y = (columns >= y[:, None]) & (columns < (y + sides[:, 1])[:, None])
     return in_x[:, :, None] & in_y[:, None, :]
@@ -185,7 +196,13 @@ def place(
     Returns:
         Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
         volumes int64 [N]; 0 where nothing was placed.
+
+    Raises:
+        ValueError: if a bin holds as many boxes as it may, or a box reaches out of the map; nothing
+            has changed then.
     """
+    if bool(((bins.count >= bins.boxes.shape[1]) & (sides > 0).all(1)).any()):
+        raise ValueError(f"a bin that can hold {bins.boxes.shape[1]} boxes is full: see max_boxes")
     if compiled(bins.device):
         return _place_cpu(bins, sides, cells, weights, com)
     return _place_torch(bins, sides, cells, weights, com)
@@ -196,7 +213,12 @@ def _place_each(
     heightmap: Any, empty_map: Any, boxes: Any, loads: Any, count: Any, filled: Any, sides: Any,
     cells: Any, weights: Any, com: Any, rest: Any, waste: Any, volume: Any,
 ) -> None:  # fmt: skip
-    depth = heightmap.shape[2]
+    width, depth = heightmap.shape[1:]
+    for b in range(heightmap.shape[0]):
+        w, d = sides[b, 0], sides[b, 1]
+        inside = 0 <= cells[b] <= (width - w) * depth + depth - d and cells[b] % depth <= depth - d
+        if w > 0 and d > 0 and sides[b, 2] > 0 and not inside:
+            raise ValueError("a box reaches out of the map")
     for b in range(heightmap.shape[0]):
         w, d, h = sides[b, 0], sides[b, 1], sides[b, 2]
         rest[b], waste[b], volume[b] = 0, 0, 0
@@ -249,7 +271,7 @@ def _place_torch(
     volume = sides.long().prod(1)
     real = volume > 0
     sides = torch.where(real[:, None], sides, 0)
-    window = footprint(bins, sides, cells)
+    window = footprint(*bins.size[:2], sides, cells)
     heights = bins.heightmap
     rest = torch.where(window, heights, 0).flatten(1).amax(1)
     gap = torch.where(window, rest[:, None, None] - heights, 0)

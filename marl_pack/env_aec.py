@@ -30,7 +30,8 @@ the bin's volume (Eq. 5-7); after each orientation both get 0.
 **End.** Both agents terminate together when the next item has no legal action (or there is none),
 and are truncated together after ``max_cycles`` items.
 
-**Info.** For both agents ``utilization`` (share of the bin filled) and ``packed`` (boxes in it).
+**Info.** For both agents ``utilization`` (share of the bin filled), ``packed`` (boxes in it) and
+``active_agent`` (whose turn it is).
 
 Version history: v0, first release.
 """
@@ -56,7 +57,7 @@ from pettingzoo.utils.conversions import (
 
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Stream, check_items
-from marl_pack.packing import ALL_ORIENTATIONS, Packing
+from marl_pack.packing import ALL_ORIENTATIONS, MOST_SKIPPED, Packing
 from marl_pack.stability import Rule
 from marl_pack.stability.candidates import NO_OFFSET
 
@@ -88,14 +89,19 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
 
     With ``simultaneous=True`` one step is one item: both agents act on the same observation, so the
     placement agent chooses before it can know the orientation. Its mask would be stale, about a
-    third of the placements it allowed would be illegal; here it is all 0 instead, and illegal
-    actions are played as ``illegal`` says. For code that needs every agent to act in every step,
-    ``illegal="repair"`` makes that playable.
+    third of the placements it allowed would be illegal; here it is all 0 instead, and an illegal
+    action is played as the nearest legal one. It is for code that needs every agent to act in every
+    step, and needs ``illegal="repair"``.
 
     Args:
         simultaneous: see above.
         **kwargs: of :func:`env`.
+
+    Raises:
+        ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
     """
+    if simultaneous and kwargs.get("illegal") != "repair":
+        raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
     convert = aec_to_parallel_wrapper if simultaneous else turn_based_aec_to_parallel_wrapper
     return convert(env(**kwargs))
 
@@ -179,6 +185,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self._unit = max(self._game.size)
         self._episode = -1
         self._seeded = False
+        self._chosen: int | None = None
         self._read_game()
 
         width, depth, _ = self._game.size
@@ -221,7 +228,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             options: ``{"items": array [L, 3]}`` plays that sequence once, whatever the stream.
 
         Raises:
-            ValueError: for items that cannot be, or a first item that may be set down nowhere.
+            ValueError: for items that cannot be, or if no episode has a legal first item.
         """
         unknown = set(options or {}) - {"items"}
         if unknown:
@@ -233,12 +240,20 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             self._stream_game.seed, self._seeded, self._episode = int(seed), True, -1
         if options and options.get("items") is not None:
             given = check_items(options["items"], self._game.size, source='options["items"]')
-            self._game = Packing(1, items=given, **self._arguments)
+            game = Packing(1, items=given, **self._arguments)
         else:
-            self._episode += 1
-            self._game = self._stream_game
-            self._game.reset(first_episode=self._episode)
-        self._game.require_start()
+            game = self._stream_game
+            for _ in range(MOST_SKIPPED):  # an episode may be over before it begins
+                self._episode += 1
+                game.reset(first_episode=self._episode)
+                if bool(game.alive):
+                    break
+        if not bool(game.alive):
+            raise ValueError(
+                f"the first item {game.items[0].tolist()} may be set down nowhere in the empty "
+                "bin: check orientations, the rule's margin and com_offset"
+            )
+        self._game = game
 
         self.agents = list(AGENTS)
         self.agent_selection = ORIENTATION
@@ -247,7 +262,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self.terminations = dict.fromkeys(AGENTS, False)
         self.truncations = dict.fromkeys(AGENTS, False)
         self._cycle = 0
-        self._chosen: int | None = None
+        self._chosen = None
         self._read_game()
         self.infos = {agent: self._info(agent) for agent in AGENTS}
 
@@ -346,7 +361,11 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return mask
 
     def _info(self, agent: str) -> dict[str, Any]:
-        info: dict[str, Any] = {"utilization": self.utilization, "packed": self._packed}
+        info: dict[str, Any] = {
+            "utilization": self.utilization,
+            "packed": self._packed,
+            "active_agent": self.agent_selection,
+        }
         if self.mask_in == "info":
             info["action_mask"] = self._mask(agent)
         return info

@@ -28,11 +28,12 @@ from scipy import stats
 
 from marl_pack.agents.heuristics import HEURISTICS, make_policy
 from marl_pack.agents.policy import Policy
-from marl_pack.items import DEFAULT_SIDES, GENERATED, Stream, load, make_stream
+from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.stability import RULES, in_equilibrium
 
-BATCH = 1024  # bins played at once
+BATCH = 1024  # bins played at once, at most
+BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
 EPISODES = 1000  # of a generated stream, unless told
 
 
@@ -63,10 +64,12 @@ def play(
         progress: called with the number of episodes that have just ended.
     """
     parts: list[tuple[NDArray[Any], ...]] = []
-    seconds, size = 0.0, (0, 0, 0)
-    for first in range(0, episodes, BATCH):
-        table = game(min(BATCH, episodes - first), first)
-        size = table.size
+    seconds, size = 0.0, game(1, 0).size
+    batch = max(1, min(BATCH, BATCH_CELLS // (size[0] * size[1])))
+    first = 0
+    while first < episodes:
+        table = game(min(batch, episodes - first), first)
+        first += batch
         progress(int((~table.alive).sum()))
         start = time.perf_counter()
         while bool(table.alive.any()):
@@ -110,13 +113,13 @@ def strict_equilibrium(
     return stands
 
 
-def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, float | list[float]]:
+def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, Any]:
     """The figures of the table; utilization in shares of the bin's volume.
 
-    The interval is Student's, over episodes; [nan, nan] for a single one.
+    The interval is Student's, over episodes; a single one has neither interval nor std (None).
     """
     u = played.utilization
-    interval = [float("nan")] * 2
+    interval: list[float] | None = None
     if len(u) > 1:
         bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
         interval = [float(bounds.low), float(bounds.high)]
@@ -124,7 +127,7 @@ def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, float | li
         "episodes": len(u),
         "utilization": float(u.mean()),
         "interval": interval,
-        "std": float(u.std(ddof=1)) if len(u) > 1 else float("nan"),
+        "std": float(u.std(ddof=1)) if len(u) > 1 else None,
         "packed": float(played.packed.mean()),
         "decisions_per_second": float(played.packed.sum() / max(played.seconds, 1e-9)),
         "strict_equilibrium": float(stands.mean()),
@@ -138,12 +141,15 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
     for column in ("episodes", "utilization %", "std", "items", "dec./s", "strict"):
         table.add_column(column, justify="right", no_wrap=True)
     for name, row in rows.items():
-        half = (row["interval"][1] - row["interval"][0]) / 2
+        spread = ("", "")
+        if row["interval"] is not None:
+            half = (row["interval"][1] - row["interval"][0]) / 2
+            spread = f" ± {100 * half:.2f}", f"{100 * row['std']:.2f}"
         table.add_row(
             name,
             str(row["episodes"]),
-            f"{100 * row['utilization']:.2f} ± {100 * half:.2f}",
-            f"{100 * row['std']:.2f}",
+            f"{100 * row['utilization']:.2f}{spread[0]}",
+            spread[1],
             f"{row['packed']:.2f}",
             f"{row['decisions_per_second']:,.0f}",
             f"{100 * row['strict_equilibrium']:.2f} %",
@@ -153,6 +159,14 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
         "strict: final stacks in strict equilibrium as a whole"
     )
+
+
+def check_writable(path: Path) -> None:
+    """Raise ValueError if a file cannot be written there."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; name a file")
 
 
 def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
@@ -238,18 +252,19 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     Raises:
         ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
     """
-    policies = {name: make_policy(name, arguments.seed) for name in arguments.policy}
+    try:
+        torch.empty(0, device=arguments.device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"--device {arguments.device}: {error}") from None
+    policies = {n: make_policy(n, arguments.seed, arguments.device) for n in arguments.policy}
     if arguments.save_stacks and len(policies) > 1:
         raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
     for path in (arguments.json, arguments.save_stacks):
-        if path is not None and not path.parent.is_dir():
-            raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    size = tuple(arguments.bin) if arguments.bin else (10, 10, 10)
-    stream: Stream
-    if arguments.items in GENERATED:
-        stream = make_stream(arguments.items, size, tuple(arguments.sides))
-    else:
-        stream, size = load(arguments.items, tuple(arguments.bin) if arguments.bin else None)
+        if path is not None:
+            check_writable(path)
+    stream, size = choose_stream(
+        arguments.items, tuple(arguments.bin) if arguments.bin else None, tuple(arguments.sides)
+    )
     episodes = arguments.episodes
     if episodes is None:
         episodes = stream.episodes or EPISODES
@@ -278,6 +293,12 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
             task = bar.add_task(f"{name}: equilibria", total=episodes)
             stands = strict_equilibrium(played, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # likewise
             rows[name] = summary(played, stands)
+            unplayable = int((played.packed == 0).sum())
+            if unplayable:
+                console.print(
+                    f"{name}: {unplayable} episodes have a first item that may be set down "
+                    "nowhere; they count as utilization 0"
+                )
             if arguments.save_stacks:
                 save_stacks(arguments.save_stacks, played)
     title = f"{arguments.items}, bin {' x '.join(map(str, size))}, rule {arguments.rule}"
@@ -289,7 +310,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
         report = {"settings": settings | {"bin": size, "episodes": episodes}, "policies": rows}
-        text = json.dumps(report, indent=2, default=str) + "\n"
+        text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
         write_atomically(arguments.json, lambda file: file.write(text.encode()))
     return rows
 
@@ -301,7 +322,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
+    except (ValueError, FileNotFoundError) as error:
         options.exit(2, f"{options.prog}: {error}\n")
     return 0
 

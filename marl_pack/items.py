@@ -10,8 +10,7 @@ the bin itself into items, so that a perfect packing is known (:func:`cut`).
 
 from __future__ import annotations
 
-import csv
-import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -24,6 +23,7 @@ from torch import Tensor
 
 from marl_pack import bins
 from marl_pack.bins import check_size
+from marl_pack.item_files import read_fields
 
 Size = tuple[int, int, int]
 
@@ -45,6 +45,11 @@ class Stream(Protocol):
     @property
     def episodes(self) -> int | None:
         """How many different episodes there are; None if there is no end of them."""
+        ...
+
+    @property
+    def longest(self) -> int | None:
+        """The most items an episode has; None if there is no end of them."""
         ...
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
@@ -127,6 +132,7 @@ class Uniform:
     low: int
     high: int
     episodes: None = None
+    longest: None = None
 
     @property
     def smallest(self) -> int:
@@ -278,11 +284,15 @@ class Cut:
         """Volume of the smallest possible piece."""
         return self.low**3
 
+    @property
+    def longest(self) -> int:
+        """As many pieces as fit if all are the smallest."""
+        return int(np.prod([s // self.low for s in self.size]))
+
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """The episodes' items, int16 [K, L, 3]."""
         boxes = cut(self.size, self.order, seed, episodes, (self.low, self.high))[..., 3:]
-        most = int(np.prod([s // self.low for s in self.size]))
-        items = torch.zeros(len(boxes), most, 3, dtype=torch.int16)
+        items = torch.zeros(len(boxes), self.longest, 3, dtype=torch.int16)
         items[:, : boxes.shape[1]] = boxes
         return items.to(episodes.device)
 
@@ -324,6 +334,11 @@ class Sequences:
         """The number of sequences."""
         return len(self.items)
 
+    @property
+    def longest(self) -> int:
+        """Length of the longest sequence."""
+        return self.items.shape[1]
+
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """Indices of the sequences, int64 [K]; the seed plays no part."""
         return episodes % len(self.items)
@@ -352,6 +367,21 @@ def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
+def _numbers(values: ArrayLike, source: str) -> NDArray[np.float64]:
+    """``values`` as float64, refused with the first row named that is not of numbers."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "iuf":
+            return array.astype(np.float64)
+    except ValueError:
+        pass  # rows of unequal length: found below
+    rows = values if isinstance(values, Iterable) else [values]
+    for number, row in enumerate(rows):
+        if np.shape(row) != (3,) or np.asarray(row).dtype.kind not in "iuf":
+            raise ValueError(f"{source}: row {number} is {row!r}: needs three numbers w, d, h")
+    raise ValueError(f"{source}: needs numbers")
+
+
 def check_items(
     items: ArrayLike,
     size: Size,
@@ -372,10 +402,7 @@ def check_items(
     Raises:
         ValueError: naming the sequence and row.
     """
-    try:
-        array = np.asarray(items, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: needs rows of three numbers w, d, h ({error})") from None
+    array = _numbers(items, source)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
@@ -412,7 +439,7 @@ def check_items(
 
     mass = array.prod(2)
     if weights is not None:
-        mass = np.asarray(weights, dtype=np.float64)
+        mass = _numbers(weights, f"{source}: weights")
         mass = mass[None] if mass.ndim == 1 else mass
         if mass.shape != (count, length):
             raise ValueError(f"{source}: weights {mass.shape}, need one an item {(count, length)}")
@@ -446,91 +473,27 @@ def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: for another ending, a missing key or column, no bin size, or an item that
-            cannot be, with its row.
+        ValueError: for another ending, a missing key or column, no bin size or another one than
+            the file's, or an item that cannot be, with its row.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; items are {', '.join(GENERATED)} or a file")
-    readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
-    if path.suffix not in readers:
-        raise ValueError(f"{path}: unknown ending {path.suffix!r}: one of {', '.join(readers)}")
-    fields = readers[path.suffix](path)
-    bin_size = size if size is not None else fields.get("bin")
+    fields = read_fields(path)
+    told = fields.get("bin")
+    try:
+        told = None if told is None else check_size(told)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    bin_size = told if size is None else check_size(size)
     if bin_size is None:
         raise ValueError(f"{path}: says no bin size; give one")
-    bin_size = check_size(tuple(np.asarray(bin_size).tolist()))
+    if told not in (None, bin_size):
+        raise ValueError(f"{path}: is for the bin {told}, not {bin_size}; give that size")
     sequences = check_items(
         fields["items"], bin_size, fields.get("weights"), fields.get("lengths"), str(path)
     )
     return sequences, bin_size
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            fields = {key: archive[key] for key in archive.files}
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable .npz archive ({error})") from error
-    if "items" not in fields:
-        raise ValueError(f"{path}: has no array 'items', only {sorted(fields)}")
-    return fields
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
-    fields = content if isinstance(content, dict) else {"items": content}
-    if "items" not in fields:
-        raise ValueError(f"{path}: has no key 'items', only {sorted(fields)}")
-    items = fields["items"]
-    nested = isinstance(items, list) and bool(items) and isinstance(items[0], list)
-    if nested and items[0] and isinstance(items[0][0], list):
-        fields["lengths"] = fields.get("lengths", [len(sequence) for sequence in items])
-        longest = max(len(sequence) for sequence in items)
-        fields["items"] = [s + [[0, 0, 0]] * (longest - len(s)) for s in items]
-        if "weights" in fields:
-            fields["weights"] = [s + [0.0] * (longest - len(s)) for s in fields["weights"]]
-    return fields
-
-
-def _read_csv(path: Path) -> dict[str, Any]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        columns = [name.strip() for name in reader.fieldnames or []]
-        missing = [name for name in ("w", "d", "h") if name not in columns]
-        if missing:
-            raise ValueError(
-                f"{path}: no column {', '.join(missing)}; the first line must name w,d,h "
-                f"(weight and sequence if wanted), it says {columns}"
-            )
-        reader.fieldnames = columns
-        sequences: dict[str, list[list[float]]] = {}
-        wanted = ["w", "d", "h"] + (["weight"] if "weight" in columns else [])
-        for number, row in enumerate(reader):
-            try:
-                values = [float(row[name]) for name in wanted]
-            except (TypeError, ValueError):
-                raise ValueError(
-                    f"{path}: row {number} is {[row[name] for name in wanted]}: "
-                    f"needs numbers for {', '.join(wanted)}"
-                ) from None
-            sequences.setdefault(row.get("sequence") or "", []).append(values)
-    if not sequences:
-        raise ValueError(f"{path}: has no items")
-    longest = max(map(len, sequences.values()))
-    table = np.zeros((len(sequences), longest, len(wanted)))
-    for k, rows in enumerate(sequences.values()):
-        table[k, : len(rows)] = rows
-    fields: dict[str, Any] = {
-        "items": table[..., :3],
-        "lengths": [len(rows) for rows in sequences.values()],
-    }
-    if "weight" in columns:
-        fields["weights"] = table[..., 3]
-    return fields
 
 
 def make_stream(
@@ -566,6 +529,22 @@ def make_stream(
         if isinstance(items, str) and not Path(items).suffix:
             raise ValueError(f"unknown items {items!r}: one of {', '.join(GENERATED)}, or a file")
         return load(items, size)[0]
-    if hasattr(items, "start") and hasattr(items, "item"):
+    if all(hasattr(items, name) for name in ("start", "item", "to", "smallest", "longest")):
         return items  # type: ignore[return-value]  # a Stream, by its two functions
-    return check_items(items, size)
+    return check_items(items, size)  # type: ignore[arg-type]  # not a stream, so an array
+
+
+def choose_stream(
+    items: str, size: Size | None = None, sides: tuple[int, int] = DEFAULT_SIDES
+) -> tuple[Stream, Size]:
+    """The stream and bin size that a command's options name.
+
+    Args:
+        items: a name in :data:`GENERATED` or a file.
+        size: (W, D, H); by default the file's own, else 10 × 10 × 10.
+        sides: shortest and longest side of generated items.
+    """
+    if items in GENERATED:
+        size = (10, 10, 10) if size is None else check_size(size)
+        return make_stream(items, size, sides), size
+    return load(items, size)

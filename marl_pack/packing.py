@@ -9,6 +9,7 @@ has no legal cell in any orientation, or when its stream has no more items.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ from marl_pack.stability import Candidates, Rule, candidates, make_rule
 from marl_pack.stability.candidates import NO_OFFSET, check_com_offset
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
+
+MOST_SKIPPED = 1000
+"""Episodes in a row whose first item has no place, before the game gives up."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,9 @@ def orientations_with_a_cell(mask: Tensor) -> Tensor:
 
 class Packing:
     """N bins, each with its own conveyor.
+
+    An episode whose first item has no legal cell in the empty bin is over before it begins: it is
+    skipped with ``auto_reset``, and leaves its bin finished without.
 
     Attributes:
         bins: what stands where (:class:`marl_pack.bins.Bins`).
@@ -124,6 +131,8 @@ class Packing:
         self.rule = rule
         self.orientations = tuple(chosen)
         self.alpha, self.beta = float(alpha), float(beta)
+        if not (math.isfinite(self.alpha) and math.isfinite(self.beta)):
+            raise ValueError(f"alpha = {alpha}, beta = {beta}: need finite numbers")
         self.com_offset = check_com_offset(com_offset)
         self.auto_reset = auto_reset
         self._index = torch.arange(n, device=self.device)
@@ -132,6 +141,8 @@ class Packing:
         self.volume = width * depth * height
         self._gain, self._loss = self.alpha / self.volume, self.beta / self.volume
         most = self.volume // self.stream.smallest
+        if self.stream.longest is not None:
+            most = min(most, self.stream.longest)
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
         self.reset(seed, first_episode)
@@ -140,7 +151,7 @@ class Packing:
         """Empty all bins and begin the episodes ``first_episode + i``.
 
         Raises:
-            ValueError: with ``auto_reset``, if a first item has no legal cell in the empty bin.
+            ValueError: with ``auto_reset``, if no episode has a legal first item.
         """
         if seed is not None:
             self.seed = int(seed)
@@ -151,7 +162,7 @@ class Packing:
         self.items, self.weights = self.stream.item(self.stream_state, self.t)
         self._look()
         if self.auto_reset:
-            self.require_start()
+            self._begin((~self.alive).nonzero().squeeze(1))
 
     def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:
         """Bool [N, 6, W, D]: where ``items`` [N, 3] may be set down in ``bins``, each way."""
@@ -189,6 +200,11 @@ class Packing:
             ValueError: if a choice is not legal; nothing has changed then.
         """
         alive = self.alive
+        if orientation.shape != (self.n,) or cell.shape != (self.n,):
+            raise ValueError(
+                f"orientation {list(orientation.shape)} and cell {list(cell.shape)}: need one "
+                f"whole number for each of {self.n} bins"
+            )
         if check:
             self._check(orientation, cell)
         sides = self._turned(orientation)
@@ -203,7 +219,7 @@ class Packing:
         filled, placed = self.bins.filled.clone(), self.bins.count.clone()
 
         # A finished bin keeps the item that found no place, and so its empty mask.
-        self.t += alive
+        self.t = self.t + alive
         self.items, self.weights = self.stream.item(self.stream_state, self.t)
         self._look()
         done = alive & ~self.alive
@@ -213,13 +229,16 @@ class Packing:
 
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
         """Raise ValueError if a choice in a living bin is not legal."""
-        wrong = self.alive & ~self.mask.flatten(2)[self._index, orientation, cell]
+        cells = self.size[0] * self.size[1]
+        real = (orientation >= 0) & (orientation < len(ORIENTATIONS)) & (cell >= 0) & (cell < cells)
+        turned, spot = torch.where(real, orientation, 0), torch.where(real, cell, 0)
+        wrong = self.alive & ~(real & self.mask.flatten(2)[self._index, turned, spot])
         if bool(wrong.any()):
             i = int(wrong.nonzero()[0])
             x, y = divmod(int(cell[i]), self.size[1])
             raise ValueError(
                 f"bin {i}: item {self.items[i].tolist()} in orientation {int(orientation[i])} may "
-                f"not be set down at ({x}, {y}); choose where the mask is true"
+                f"not be set down at ({x}, {y}), cell {int(cell[i])}; choose where the mask is true"
             )
 
     def _look(self) -> None:
@@ -229,30 +248,28 @@ class Packing:
         self.alive = self.orientation_mask.any(1)
 
     def _begin(self, which: Tensor) -> None:
-        """Begin the next episode in the bins ``which`` (int64 [K])."""
-        if not len(which):
-            return
-        self.episode[which] += self.n
-        self.t[which] = 0
-        state.clear(self.bins, which)
-        self.stream_state[which] = self.stream.start(self.seed, self.episode[which])
-        items, weights = self.stream.item(self.stream_state[which], self.t[which])
-        mask = self.masks(self._empty[: len(which)], items, weights)
-        orientation_mask = orientations_with_a_cell(mask)
-        self._require(orientation_mask.any(1), items)
-        self.items[which], self.weights[which], self.mask[which] = items, weights, mask
-        self.orientation_mask[which] = orientation_mask
-        self.alive[which] = True
+        """Begin the next episode in the bins ``which`` (int64 [K]) that has a legal first item.
 
-    def require_start(self) -> None:
-        """Raise ValueError if an item that has come may be set down nowhere."""
-        self._require(self.alive, self.items)
-
-    def _require(self, alive: Tensor, items: Tensor) -> None:
-        if not bool(alive.all()):
-            i = int((~alive).nonzero()[0])
+        Raises:
+            ValueError: if there is none within :data:`MOST_SKIPPED` episodes.
+        """
+        for _ in range(MOST_SKIPPED):
+            if not len(which):
+                return
+            self.episode[which] += self.n
+            self.t[which] = 0
+            state.clear(self.bins, which)
+            self.stream_state[which] = self.stream.start(self.seed, self.episode[which])
+            items, weights = self.stream.item(self.stream_state[which], self.t[which])
+            mask = self.masks(self._empty[: len(which)], items, weights)
+            orientation_mask = orientations_with_a_cell(mask)
+            self.items[which], self.weights[which], self.mask[which] = items, weights, mask
+            self.orientation_mask[which] = orientation_mask
+            self.alive[which] = orientation_mask.any(1)
+            which = which[~self.alive[which]]
+        if len(which):
             raise ValueError(
-                f"the first item of an episode, {items[i].tolist()}, may be set down nowhere in "
-                f"the empty bin {self.size}: check the orientations allowed {self.orientations}, "
-                "the rule's margin and com_offset"
+                f"no item that begins an episode, such as {self.items[which[0]].tolist()}, may be "
+                f"set down anywhere in the empty bin {self.size}: check the orientations allowed "
+                f"{self.orientations}, the rule's margin and com_offset"
             )

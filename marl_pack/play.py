@@ -16,8 +16,8 @@ from rich.table import Table
 
 from marl_pack.agents.heuristics import HEURISTICS, make_policy
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.evaluate import write_atomically
-from marl_pack.items import GENERATED
+from marl_pack.evaluate import check_writable, write_atomically
+from marl_pack.items import GENERATED, choose_stream
 from marl_pack.packing import Packing
 from marl_pack.stability import RULES, in_equilibrium
 
@@ -32,8 +32,8 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument
     add("--policy", default="dblf", choices=list(HEURISTICS), help="who plays both agents")
     add("--items", default="rs", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
-    add("--bin", nargs=3, type=int, default=(10, 10, 10), metavar=("W", "D", "H"),
-        help="bin size in cells")  # fmt: skip
+    add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
+        help="bin size in cells (default: the file's own, else 10 10 10)")  # fmt: skip
     add("--rule", default="hull_alpha", choices=list(RULES), help="stability rule of the masks")
     add("--seed", type=int, default=0, help="of generated items and of random play")
     add("--episode", type=int, default=0, help="number of the sequence")
@@ -47,11 +47,13 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     Raises:
         ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
     """
-    if chosen.picture.suffix != ".png":
+    if chosen.picture.suffix.lower() != ".png":
         raise ValueError(f"--picture {chosen.picture}: needs the ending .png")
+    check_writable(chosen.picture)
+    stream, size = choose_stream(chosen.items, tuple(chosen.bin) if chosen.bin else None)
     policy = make_policy(chosen.policy, chosen.seed)
     game = Packing(
-        1, tuple(chosen.bin), chosen.items, rule=chosen.rule, seed=chosen.seed,
+        1, size, stream, rule=chosen.rule, seed=chosen.seed,
         first_episode=chosen.episode, auto_reset=False,
     )  # fmt: skip
     table = Table(title=f"{chosen.policy} plays {chosen.items}, episode {chosen.episode}")

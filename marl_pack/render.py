@@ -165,6 +165,8 @@ def draw(
         colour = PALETTE[len(boxes) % len(PALETTE)]
         _draw_item(figure, (0.01, 0.36, beside, 0.40), item, colour, scale)
     if masks is not None:
+        legend = "green: where the item's low corner may lie"
+        figure.text(0.01, 0.02, legend, size=9, color=LEGAL)
         _draw_masks(figure, (0.68, 0.035, 0.315, 0.89), size, checked, masks, labels)
 
     figure.canvas.draw()

@@ -95,3 +95,15 @@ def test_cleared_bins_are_empty_and_the_others_untouched() -> None:
     assert int(bins.heightmap[[1, 4]].sum()) == 0
     for now, then in zip(bins[kept].tensors(), before[kept].tensors(), strict=True):
         assert torch.equal(now, then)
+
+
+def test_a_full_bin_and_a_box_outside_are_refused() -> None:
+    bins = stack((2, 2, 9), (0, 0, 0, 2, 2, 1))
+    box = torch.tensor([[1, 1, 1]], dtype=torch.int16)
+    state.place(bins, box, torch.tensor([0]))
+    with pytest.raises(ValueError, match="full"):
+        state.place(bins, box, torch.tensor([0]))
+    for cell in (-1, 4, 3):
+        with pytest.raises(ValueError, match="out of the map"):
+            wide = torch.tensor([[1, 1 + (cell == 3), 1]], dtype=torch.int16)
+            state.place(state.empty(1, (2, 2, 9)), wide, torch.tensor([cell]))

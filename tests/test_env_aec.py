@@ -80,10 +80,12 @@ def test_pettingzoos_parallel_test_passes() -> None:
 
 @pytest.mark.filterwarnings("ignore")
 def test_pettingzoos_max_cycles_test_passes() -> None:
-    # It plays without masks and takes one parallel step for one cycle.
+    # It plays at random without masks, and takes one parallel step for one cycle: four items must
+    # never fill the bin.
+    roomy: dict[str, Any] = {"illegal": "repair", "bin_size": (20, 20, 20), "sides": (1, 2)}
     module = SimpleNamespace(
-        env=partial(env_aec.env, illegal="repair"),
-        parallel_env=partial(env_aec.parallel_env, illegal="repair", simultaneous=True),
+        env=partial(env_aec.env, **roomy),
+        parallel_env=partial(env_aec.parallel_env, simultaneous=True, **roomy),
     )
     max_cycles_test(module)
 
@@ -391,6 +393,46 @@ def test_wrappers_stand_in_pettingzoos_order() -> None:
 def test_what_cannot_be_is_refused(arguments: dict[str, Any], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         env_aec.env(**arguments)
+
+
+def test_parallel_steps_of_both_agents_at_once_need_repair() -> None:
+    with pytest.raises(ValueError, match="repair"):
+        env_aec.parallel_env(simultaneous=True)
+
+
+def test_whose_turn_it_is_stands_in_every_info() -> None:
+    env = env_aec.parallel_env(items=[[5, 5, 5]])
+    _, infos = env.reset()
+    assert [info["active_agent"] for info in infos.values()] == [O, O]
+    *_, infos = env.step({O: 0, P: 0})
+    assert [info["active_agent"] for info in infos.values()] == [P, P]
+    *_, infos = env.step({O: 0, P: 0})
+    assert set(infos) == {O, P}
+
+
+def test_a_refused_reset_leaves_the_game_as_it_was() -> None:
+    env = env_aec.raw_env(rule_parameters={"margin": 1.0}, sides=(3, 5))
+    env.reset(seed=0)
+    before = env.state()
+    with pytest.raises(ValueError, match="set down nowhere"):
+        env.reset(options={"items": [[2, 2, 2]]})
+    assert (env.state() == before).all()
+
+
+def test_observations_can_be_asked_for_before_the_first_reset() -> None:
+    env = env_aec.raw_env()
+    assert env.state_space.contains(env.state())
+    assert env.observation_space(O).contains(env.observe(O))
+
+
+def test_an_episode_that_cannot_begin_is_skipped() -> None:
+    rows = [[[2, 2, 9]], [[3, 3, 3]], [[2, 9, 2]], [[4, 4, 4]]]
+    env = env_aec.raw_env(bin_size=(9, 5, 5), items=rows, orientations=(0,))
+    seen = []
+    for _ in range(3):
+        env.reset()
+        seen.append(round(float(env.state()[1, 0, 0]) * 9))
+    assert seen == [3, 4, 3]
 
 
 def test_a_first_item_without_a_place_is_refused_at_reset() -> None:

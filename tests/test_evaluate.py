@@ -124,6 +124,8 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--orientations 7", "orientations"),
         ("--json nowhere/out.json", "does not exist"),
         ("--policy dblf random --save-stacks s.npz", "one policy"),
+        ("--json tests", "is a folder"),
+        ("--device nowhere", "--device nowhere"),
     ],
 )
 def test_what_cannot_be_is_refused_without_a_traceback(
@@ -147,6 +149,19 @@ def test_more_episodes_than_a_file_has_are_refused(
         evaluate.main([*options, "--episodes", "2"])
     assert "1 … 1" in capsys.readouterr().err
     assert evaluate.main(options) == 0
+
+
+def test_a_single_episode_has_no_interval(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    assert evaluate.main(["--episodes", "1", "--json", str(out)]) == 0
+    row = json.loads(out.read_text(), parse_constant=pytest.fail)["policies"]["dblf"]
+    assert row["interval"] is None
+    assert row["std"] is None
+
+
+def test_episodes_that_cannot_begin_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate.main(["--margin", "1", "--episodes", "40"]) == 0
+    assert "may be set down nowhere" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_foreign_file_of_stacks_is_refused(tmp_path: Path) -> None:

@@ -183,6 +183,14 @@ def test_files_give_sequences_weights_and_bin(tmp_path: Path) -> None:
         ("f.json", '{"boxes": []}', "no key 'items'"),
         ("g.npz", "not an archive", "archive"),
         ("h.txt", "1 2 3", "ending"),
+        ("i.json", '{"items": [[2,2,2],[2,3],[2,2,2]]}', "row 1"),
+        ("j.json", '{"items": [[[2,2,2]], 5]}', "sequence 1"),
+        ("k.json", '{"items": [[2,2,true]]}', "row 0"),
+        ("l.json", '{"items": [[2,2,2]], "bin": 10}', "bin size"),
+        ("m.json", '{"items": [[2,2,2]], "bin": [20,20,20]}', "is for the bin"),
+        ("n.json", '{"items": [[[2,2,2]],[[3,3,3]]], "weights": [1]}', "weights"),
+        ("o.csv", "w,w,d,h\n1,2,3,4\n", "twice"),
+        ("p.csv", "w,d,h\n1,2,3,4\n", "row 0 .line 2."),
     ],
 )
 def test_an_unreadable_file_is_refused(name: str, text: str, why: str, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def test_a_game_worked_by_hand() -> None:
     assert float(first.reward) == pytest.approx(2 * 32 / 64)
     assert not bool(first.done)
     assert game.items.tolist() == [[2, 2, 2]]
-    # The cube's twelve other orientations are the same: all nine places, each way.
+    # However the cube is turned, it has nine places.
     assert game.mask[0].flatten(1).sum(1).tolist() == [9] * 6
     second = game.place(torch.tensor([5]), torch.tensor([0]))
     assert float(second.reward) == pytest.approx(2 * 8 / 64)
@@ -73,7 +73,7 @@ def test_every_play_the_mask_allows_ends_with_an_item_that_has_no_place(
 
 
 def test_a_bins_game_does_not_depend_on_the_others() -> None:
-    policy = HEURISTICS["dblf"](0)
+    policy = make_policy("dblf")
     together = Packing(12, seed=4, auto_reset=False)
     while together.alive.any():
         together.place(*policy(together))
@@ -158,6 +158,34 @@ def test_an_illegal_placement_is_refused_and_changes_nothing(auto_reset: bool) -
     assert (game.t == 0).all()
 
 
+@pytest.mark.parametrize(("orientation", "cell"), [(0, -1), (0, 25), (-1, 0), (6, 0)])
+def test_an_action_out_of_range_is_refused(orientation: int, cell: int) -> None:
+    game = Packing(1, (5, 5, 5), seed=0)
+    with pytest.raises(ValueError, match="may not be set down"):
+        game.place(torch.tensor([orientation]), torch.tensor([cell]))
+    with pytest.raises(ValueError, match="one whole number for each of 1 bins"):
+        game.place(torch.zeros(2, dtype=torch.int64), torch.zeros(1, dtype=torch.int64))
+    assert int(game.bins.count) == 0
+
+
+def test_an_episode_that_cannot_begin_is_skipped_or_over() -> None:
+    rows = [[[2, 2, 9]], [[3, 3, 3]], [[2, 9, 2]], [[4, 4, 4]]]
+    arguments = {"size": (9, 5, 5), "items": rows, "orientations": (0,)}
+    game = Packing(1, **arguments)  # type: ignore[arg-type]
+    seen = []
+    for _ in range(4):
+        seen.append(int(game.items[0, 0]))
+        game.place(torch.tensor([0]), torch.tensor([0]))
+    assert seen == [3, 4, 3, 4]
+    still = Packing(4, auto_reset=False, **arguments)  # type: ignore[arg-type]
+    assert still.alive.tolist() == [False, True, False, True]
+    # A margin that some items can never meet does not stop a long run.
+    game, policy = Packing(64, rule_parameters={"margin": 1.0}), make_policy("random")
+    for _ in range(60):
+        game.place(*policy(game))
+        assert game.alive.all()
+
+
 def test_orientations_that_are_not_allowed_have_no_cell() -> None:
     game = Packing(16, seed=7, orientations=(0, 1), auto_reset=False)
     policy = make_policy("dblf")
@@ -205,8 +233,10 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"items": [[2, 2, 11]]}, "row 0"),
         ({"size": (10, 10)}, "bin size"),
         ({"com_offset": (0.6, 0, 0)}, "com_offset"),
-        ({"rule_parameters": {"margin": 3.0}}, "may be set down nowhere"),
-        ({"size": (4, 10, 10), "items": [[9, 2, 2]], "orientations": (0,)}, "set down nowhere"),
+        ({"alpha": float("nan")}, "alpha"),
+        ({"size": (40000, 10, 10)}, "at most 32767"),
+        ({"rule_parameters": {"margin": 3.0}}, "no item that begins an episode"),
+        ({"size": (4, 9, 9), "items": [[9, 2, 2]], "orientations": (0,)}, "no item that begins"),
     ],
 )
 def test_what_cannot_be_played_is_refused(arguments: dict[str, object], why: str) -> None:

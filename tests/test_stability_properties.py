@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ from marl_pack.stability import (
     lbcp,
     make_rule,
     reference,
+    stable_mask,
+    static_equilibrium,
     support_area,
 )
 from marl_pack.stability.load_bearing import _bearing_torch, lbcp_bearing
@@ -318,6 +321,57 @@ def test_reduced_equilibrium_equals_the_whole_stacks_linear_program(
             assert force < 1e-12  # nothing lies near the threshold
     assert checked > 100
     assert min(positive) > 1e3 * STRICT
+
+
+@pytest.mark.parametrize(
+    ("size", "sides", "steps"), [((12, 9, 400), (1, 7), 60), ((40, 40, 120), (4, 20), 60)]
+)
+def test_reduced_equilibrium_equals_the_linear_program_on_tall_stacks(
+    size: tuple[int, int, int], sides: tuple[int, int], steps: int
+) -> None:
+    bins = random_play(equilibrium, 8, size, sides, steps, seed=30)
+    item = candidates(some_items(8, sides, 31))
+    exact, band = equilibrium(bins, item), hull_1(bins, item) & ~hull_alpha(bins, item)
+    cells = band.nonzero()
+    assert len(cells) > 100
+    for b, a, x, y in cells[:: len(cells) // 60].tolist():
+        w, d, h = item.sides[b, a].tolist()
+        z = int(bins.heightmap[b, x : x + w, y : y + d].max())
+        stack = np.vstack((boxes_of(bins, b), [x, y, z, w, d, h]))
+        assert in_equilibrium(stack) == bool(exact[b, a, x, y])
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "verdict"),
+    [("falls", (12, 9, 400), False), ("stands", (120, 120, 240), True)],
+)
+def test_stacks_that_try_the_simplex_hard(
+    name: str, size: tuple[int, int, int], verdict: bool
+) -> None:
+    # Eighty and forty boxes deep: most pivots are degenerate, and small ones spoil the numbers.
+    with np.load(Path(__file__).parent / "data" / "hard_stacks.npz") as archive:
+        boxes = archive[name]
+    heights, gaps = np.zeros(size[:2], int), np.zeros(size[:2], int)
+    for x, y, z, w, d, h in boxes[:-1]:
+        window = np.s_[x : x + w, y : y + d]
+        gaps[window] += z - heights[window]
+        heights[window] = z + h
+    last = boxes[-1]
+    mask = stable_mask("equilibrium", heights, gaps, last[3:], size[2], boxes[:-1])
+    assert mask[last[0], last[1]] == in_equilibrium(boxes) == verdict
+
+
+def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    bins = random_play(hull_alpha, 6, (7, 7, 12), (1, 5), 12, seed=32)
+    item = candidates(some_items(6, (1, 5), 33))
+    expected_mask = equilibrium(bins, item)
+
+    def unsure(*arrays: np.ndarray) -> None:
+        *_, band, verdict = arrays
+        verdict[band] = static_equilibrium.UNSURE
+
+    monkeypatch.setattr(static_equilibrium, "_solve_band", unsure)
+    assert torch.equal(equilibrium(bins, item), expected_mask)
 
 
 def test_equilibrium_with_a_margin_asks_for_every_place_of_the_centre() -> None:

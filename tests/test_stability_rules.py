@@ -216,11 +216,25 @@ def test_equilibrium_does_not_trust_a_stack_that_already_falls() -> None:
     assert mask[:, 0].tolist() == [True, False, False, False, False, False]
 
 
+def test_a_bound_rule_is_asked_as_carefully_as_a_named_one() -> None:
+    boxes = np.array([(0, 0, 0, 1, 4, 2), (0, 0, 2, 5, 4, 1)])  # falls
+    heights, gaps = np.zeros((6, 4), int), np.zeros((6, 4), int)
+    heights[:5], gaps[1:5] = 3, 2
+    for rule in ("equilibrium", make_rule("equilibrium")):
+        assert not stable_mask(rule, heights, gaps, (1, 1, 1), 8, boxes).any()
+    for name in ("lbcp", "equilibrium"):
+        with pytest.raises(ValueError, match="give boxes"):
+            stable_mask(make_rule(name), heights, gaps, (1, 1, 1), 8)
+    with pytest.raises(ValueError, match="go with the name of a rule"):
+        stable_mask(make_rule("hull_1"), heights, gaps, (1, 1, 1), 8, margin=1.0)
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
         ({"rule": "hull"}, "unknown stability rule"),
         ({"margin": -1.0}, "margin"),
+        ({"margin": True}, "margin"),
         ({"margin": float("nan")}, "margin"),
         ({"thresholds": "paper"}, "no parameter 'thresholds'"),
         ({"item": (2, 2)}, "item"),

@@ -111,7 +111,7 @@ def best_fit(game: Packing) -> tuple[Tensor, Tensor]:
 
 def random_policy(seed: int, device: torch.device | str = "cpu") -> Policy:
     """Uniform among the legal orientations, then uniform among the cells of the chosen one."""
-    generator = torch.Generator(device).manual_seed(seed)
+    generator = torch.Generator(device).manual_seed(seed % 2**63)
 
     def play(game: Packing) -> tuple[Tensor, Tensor]:
         orientation = draw(game.orientation_mask, generator)
@@ -120,21 +120,21 @@ def random_policy(seed: int, device: torch.device | str = "cpu") -> Policy:
     return play
 
 
-HEURISTICS: dict[str, Callable[[int], Policy]] = {
-    "dblf": lambda seed: dblf,
-    "height_min": lambda seed: height_min,
-    "best_fit": lambda seed: best_fit,
+HEURISTICS: dict[str, Callable[[int, torch.device | str], Policy]] = {
+    "dblf": lambda seed, device: dblf,
+    "height_min": lambda seed, device: height_min,
+    "best_fit": lambda seed, device: best_fit,
     "random": random_policy,
 }
-"""Name -> function of a seed that makes the policy (only ``random`` uses the seed)."""
+"""Name -> function of a seed and a device that makes the policy (only ``random`` uses them)."""
 
 
-def make_policy(name: str, seed: int = 0) -> Policy:
-    """The policy called ``name``.
+def make_policy(name: str, seed: int = 0, device: torch.device | str = "cpu") -> Policy:
+    """The policy called ``name``, for games on ``device``.
 
     Raises:
         ValueError: for an unknown name.
     """
     if name not in HEURISTICS:
         raise ValueError(f"unknown policy {name!r}: one of {', '.join(HEURISTICS)}")
-    return HEURISTICS[name](seed)
+    return HEURISTICS[name](seed, device)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.bins import Bins, check_size
 from marl_pack.stability.candidates import NO_OFFSET, Candidates, Rule, check_com_offset
-from marl_pack.stability.rules import make_rule
+from marl_pack.stability.rules import equilibrium, lbcp, make_rule
 from marl_pack.stability.static_equilibrium import uniform_loads
 
 
@@ -35,7 +38,8 @@ def stable_mask(
         bin_height: H in cells.
         boxes: rows x, y, z, w, d, h of what stands in the bin; ``lbcp`` and ``equilibrium`` need
             them unless the bin is empty.
-        weights: the boxes' weights [n] (``equilibrium``); their volumes by default.
+        weights: the boxes' weights [n] (``equilibrium``); their volumes by default. Their centres
+            of mass are taken to be central.
         weight: the item's weight; its volume by default.
         com_offset: how far the item's centre of mass lies from its geometric centre, as fractions
             of w, d, h.
@@ -60,9 +64,18 @@ def stable_mask(
     sides = _whole("item", item)
     if sides.shape != (3,) or sides.min() < 1:
         raise ValueError(f"item {item!r}: needs three whole sides w, d, h ≥ 1 in cells")
-    needs_boxes = rule in ("lbcp", "equilibrium")
-    if boxes is None and needs_boxes and heights.any():
-        raise ValueError(f"rule {rule!r} looks at the whole stack: give boxes, rows x y z w d h")
+    chosen: Callable[..., torch.Tensor]
+    if isinstance(rule, str):
+        chosen = make_rule(rule, **parameters)
+    elif parameters:
+        raise ValueError(f"{sorted(parameters)} go with the name of a rule, not with a bound one")
+    else:
+        chosen = rule
+    function = getattr(chosen, "func", chosen)
+    if boxes is None and function in (lbcp, equilibrium) and heights.any():
+        raise ValueError("the rule looks at the whole stack: give boxes, rows x y z w d h")
+    if function is equilibrium and "check_stack" not in getattr(chosen, "keywords", {}):
+        chosen = partial(equilibrium, **getattr(chosen, "keywords", {}), check_stack=True)
     stack, load = _stack(boxes, weights, heights, gaps)
     if weight is not None and not 0 < weight < float("inf"):
         raise ValueError(f"weight {weight!r}: needs a positive number")
@@ -84,9 +97,6 @@ def stable_mask(
         com[None, None] if any(offset[:2]) else None,
         None if weight is None else torch.tensor([float(weight)]),
     )
-    if rule == "equilibrium":
-        parameters.setdefault("check_stack", True)
-    chosen = make_rule(rule, **parameters) if isinstance(rule, str) else rule
     return chosen(bins, candidate)[0, 0].numpy()
 
 

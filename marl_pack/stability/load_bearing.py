@@ -79,7 +79,7 @@ def _bearing_torch(bins: Bins) -> Tensor:
     for k in range(int(bins.count.max()) if n else 0):
         here = torch.nonzero(bins.count > k).squeeze(1)
         corner, rest, sides = bins.boxes[here, k].long().tensor_split((2, 3), 1)
-        under = footprint(bins[here], sides, corner[:, 0] * depth + corner[:, 1])
+        under = footprint(width, depth, sides, corner[:, 0] * depth + corner[:, 1])
         x, y = corner[:, 0], corner[:, 1]
         held = bearing[here] & (height[here] == rest[:, None]) & under
         rows = torch.arange(len(here), device=bins.device)

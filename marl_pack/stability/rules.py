@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import torch
@@ -117,8 +119,9 @@ def make_rule(name: str, **parameters: object) -> Rule:
     for key in parameters:
         if key not in known:
             raise ValueError(f"rule {name!r} has no parameter {key!r}: it takes {known}")
-    margin = parameters.get("margin", 0.0)
-    if not isinstance(margin, int | float) or not 0 <= margin < float("inf"):
+    margin: Any = parameters.get("margin", 0.0)
+    number = not isinstance(margin, bool) and isinstance(margin, Real)
+    if not number or not 0 <= margin < math.inf:
         raise ValueError(f"margin {margin!r}: needs a number of cells ≥ 0")
     if name == "area_ratio":
         thresholds: Any = parameters.get("thresholds", "paper")

@@ -26,7 +26,8 @@ reference. A mask asks thousands of such questions, so :func:`equilibrium_mask` 
 - *Components.* Boxes that no chain of contacts through ungrounded boxes joins to the new one keep
   the balance they had: the cone is a product.
 
-What remains (a handful of boxes) goes to a small dense simplex.
+What remains (a handful of boxes) goes to a small dense simplex, whose forces are put back into the
+equations; where they do not bear its verdict out, HiGHS decides.
 """
 
 from __future__ import annotations
@@ -47,7 +48,10 @@ from marl_pack.stability.hull_cpu import envelope
 
 STRICT = 1e-9
 """Least force, in mean weights of the stack, that counts as positive. Sizes are small integers, so
-true optima are either 0 up to rounding or larger by orders of magnitude; ``tests`` hold the gap."""
+true optima are either 0 up to rounding or larger by orders of magnitude; ``tests`` hold the gap.
+HiGHS balances to 1e-7: weights that differ by more than ten million times are beyond it."""
+
+NO, YES, UNSURE = 0, 1, 2
 
 DIRECTIONS = 16
 """Corners of the polygon drawn around the disc of radius ``margin`` (2 % on the safe side)."""
@@ -154,41 +158,55 @@ def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
 
 
 @njit(cache=True)
-def _optimise(table: Any, basis: Any, columns: int, enough: float) -> None:
+def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     """Minimise the last row's objective by the simplex method, until it is below ``-enough``.
 
-    Largest coefficient first, Bland's rule once that might cycle.
+    Largest coefficient first, and among tied rows (the moments' right-hand sides are all 0) the
+    largest pivot, which keeps the numbers sound; Bland's rule once that might cycle.
+
+    Returns:
+        Whether it came to an end.
     """
     rows = basis.size
     for iteration in range(200 * rows + 1000):
         if -table[rows, -1] < -enough:
-            return
+            return True
+        bland = iteration > 5 * rows + 50
         column, least = -1, -1e-10
         for j in range(columns):
             if table[rows, j] < least:
                 column = j
-                if iteration > 5 * rows + 50:
+                if bland:
                     break
                 least = table[rows, j]
         if column < 0:
-            return
+            return True
         row, best = -1, np.inf
         for i in range(rows):
-            if table[i, column] > 1e-10:
-                ratio = max(table[i, -1], 0.0) / table[i, column]
-                if ratio < best - 1e-13 or (ratio <= best + 1e-13 and basis[i] < basis[row]):
+            pivot = table[i, column]
+            if pivot > 1e-9:
+                ratio = max(table[i, -1], 0.0) / pivot
+                tied = row >= 0 and ratio <= best + 1e-13
+                if bland:
+                    better = tied and basis[i] < basis[row]
+                else:
+                    better = tied and pivot > table[row, column]
+                if ratio < best - 1e-13 or better:
                     row, best = i, ratio
         if row < 0:
-            return
+            return True
         _pivot(table, basis, row, column)
+    return False
 
 
 @njit(cache=True)
-def max_least_force(a: Any, weight: Any, enough: float) -> float:
+def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
     """``max t, a f = weight, f ≥ t`` for ``a`` [R, m] of full row rank and ``weight`` [R] ≥ 0.
 
     Returns:
-        The optimum, or the first value found above ``enough``; -inf if no ``f ≥ 0`` solves it.
+        The optimum, or the first value found above ``enough``; -inf if no ``f ≥ 0`` solves it. And
+        whether the forces, put back into the equations, bear it out: false where rounding errors
+        have spoilt the tableau.
     """
     rows, columns = a.shape
     table = np.zeros((rows + 1, columns + 2))  # g, t, right-hand side; objective in the last row
@@ -200,24 +218,43 @@ def max_least_force(a: Any, weight: Any, enough: float) -> float:
         table[i, columns + 1] = weight[i]
         basis[i] = columns + 1 + i  # an artificial variable, never stored
         table[rows] -= table[i]
-    _optimise(table, basis, columns + 1, np.inf)
-    if -table[rows, columns + 1] > 1e-9:
-        return -np.inf
-    for i in range(rows):  # drive artificial variables, now zero, out of the basis
-        if basis[i] > columns:
-            best = 0
-            for j in range(columns + 1):
-                if abs(table[i, j]) > abs(table[i, best]):
-                    best = j
-            if abs(table[i, best]) > 1e-9:
-                _pivot(table, basis, i, best)
-    table[rows] = 0.0
-    table[rows, columns] = -1.0
+    sound = _optimise(table, basis, columns + 1, np.inf)
+    missing = -table[rows, columns + 1]
+    feasible = missing <= 1e-9
+    if feasible:
+        for i in range(rows):  # drive artificial variables, now zero, out of the basis
+            if basis[i] > columns:
+                best = 0
+                for j in range(columns + 1):
+                    if abs(table[i, j]) > abs(table[i, best]):
+                        best = j
+                if abs(table[i, best]) > 1e-9:
+                    _pivot(table, basis, i, best)
+                else:
+                    sound = False
+        table[rows] = 0.0
+        table[rows, columns] = -1.0
+        for i in range(rows):
+            if basis[i] == columns:
+                table[rows] += table[i]
+        sound = _optimise(table, basis, columns + 1, enough) and sound
+        missing = 0.0
+
+    force, t = np.zeros(columns), 0.0
     for i in range(rows):
-        if basis[i] == columns:
-            table[rows] += table[i]
-    _optimise(table, basis, columns + 1, enough)
-    return table[rows, columns + 1]
+        if basis[i] < columns:
+            force[basis[i]] += table[i, columns + 1]
+        elif basis[i] == columns:
+            t = table[i, columns + 1]
+    force += t
+    lacking = 0.0
+    for i in range(rows):
+        rest = weight[i]
+        for j in range(columns):
+            rest -= a[i, j] * force[j]
+        lacking += abs(rest)
+    sound = sound and abs(lacking - missing) < 1e-7 and force.min() > -1e-9
+    return (t if feasible else -np.inf), sound
 
 
 @njit(cache=True)
@@ -289,8 +326,11 @@ def _survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[A
 @njit(cache=True)
 def _stands(
     boxes: Any, loads: Any, n: int, grounded: Any, points: Any, count: Any, whole: bool
-) -> bool:
-    """Whether box ``n``, set on the boxes before it, leaves its component in strict equilibrium."""
+) -> int:
+    """Whether box ``n``, set on the boxes before it, leaves its component in strict equilibrium.
+
+    NO, YES or UNSURE, where the simplex could not be trusted.
+    """
     member = np.full(n + 1, -1, np.int64)  # row of each box in the system
     queue = np.empty(n + 1, np.int64)
     size, head = 1, 0
@@ -343,15 +383,21 @@ def _stands(
                 a[3 * m + 1, c] = -(px - loads[j, 1]) / other
                 a[3 * m + 2, c] = -(py - loads[j, 2]) / other
                 c += 1
-    return max_least_force(a, weight, 1e3 * STRICT) > STRICT
+    force, sound = max_least_force(a, weight, 1e3 * STRICT)
+    if not sound:
+        return UNSURE
+    return YES if force > STRICT else NO
 
 
 @njit(cache=True, nogil=True)
 def _solve_band(
     heightmap: Any, empty_map: Any, boxes: Any, loads: Any, count: Any, sides: Any, com: Any,
-    weight: Any, shifts: Any, whole: Any, band: Any, mask: Any,
+    weight: Any, shifts: Any, whole: Any, band: Any, verdict: Any,
 ) -> None:  # fmt: skip
-    """Set ``mask`` [N, A, W, D] where a cell of ``band`` stands with every shift of its centre."""
+    """Write YES, NO or UNSURE to ``verdict`` [N, A, W, D] for every cell of ``band``.
+
+    YES: the stack stands with every one of the ``shifts`` [S, 2] of the new box's centre of mass.
+    """
     n, width, depth = heightmap.shape
     scratch = np.empty((3, 2 * width + 2, 2), np.int64)
     solid = np.empty((width, depth), np.bool_)
@@ -365,6 +411,8 @@ def _solve_band(
         grounded, points, size = _survey(stack, k, (width, depth), scratch)
         for a in range(sides.shape[1]):
             w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
+            if w < 1 or d < 1 or h < 1:
+                continue
             for x in range(width - w + 1):
                 for y in range(depth - d + 1):
                     if not band[b, a, x, y]:
@@ -383,14 +431,14 @@ def _solve_band(
                         solid[:w, :d], scratch[0, :, 0], scratch[0, :, 1], scratch[1], scratch[2],
                         points[k],
                     )  # fmt: skip
-                    stands = True
+                    stands = YES
                     load[k, 0] = weight[b]
                     for s in range(shifts.shape[0]):
                         load[k, 1] = x + com[b, a, 0] + shifts[s, 0]
                         load[k, 2] = y + com[b, a, 1] + shifts[s, 1]
-                        if stands:
+                        if stands == YES:
                             stands = _stands(stack, load, k, grounded, points, size, whole[b])
-                    mask[b, a, x, y] = stands
+                    verdict[b, a, x, y] = stands
 
 
 def equilibrium_mask(
@@ -429,11 +477,30 @@ def equilibrium_mask(
     if margin > 0:
         angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
         shifts = margin / np.cos(np.pi / DIRECTIONS) * np.stack((np.cos(angle), np.sin(angle)), 1)
-    mask = sure.cpu().clone()
+    verdict = np.zeros(tuple(band.shape), np.uint8)
     inputs = (
         stack.heightmap, stack.empty_map, stack.boxes, stack.loads, stack.count,
         candidates.sides, candidates.centres(), candidates.weights(),
-        torch.from_numpy(shifts), torch.from_numpy(whole), band, mask,
+        torch.from_numpy(shifts), torch.from_numpy(whole), band,
     )  # fmt: skip
-    _solve_band(*(tensor.cpu().contiguous().numpy() for tensor in inputs))
-    return mask.to(device)
+    _solve_band(*(tensor.cpu().contiguous().numpy() for tensor in inputs), verdict)
+    for b, a, x, y in np.argwhere(verdict == UNSURE).tolist():
+        verdict[b, a, x, y] = _stands_by_highs(stack, candidates, b, a, x, y, shifts)
+    return sure | torch.from_numpy(verdict == YES).to(device)
+
+
+def _stands_by_highs(
+    stack: Bins, candidates: Candidates, b: int, a: int, x: int, y: int, shifts: NDArray[np.float64]
+) -> bool:
+    """The verdict on one cell by the whole stack's linear program."""
+    k = int(stack.count[b])
+    w, d, h = candidates.sides[b, a].tolist()
+    z = int(stack.heightmap[b, x : x + w, y : y + d].max())
+    boxes = np.vstack((stack.boxes[b, :k].numpy(), (x, y, z, w, d, h)))
+    corner = np.array((x, y))
+    centre = corner + candidates.centres()[b, a].cpu().numpy()
+    weight = float(candidates.weights()[b])
+    loads = [
+        np.vstack((stack.loads[b, :k].numpy(), (weight, *(centre + shift)))) for shift in shifts
+    ]
+    return all(in_equilibrium(boxes, load) for load in loads)
