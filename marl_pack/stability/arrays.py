@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
@@ -74,8 +73,9 @@ def stable_mask(
     function = getattr(chosen, "func", chosen)
     if boxes is None and function in (lbcp, equilibrium) and heights.any():
         raise ValueError("the rule looks at the whole stack: give boxes, rows x y z w d h")
-    if function is equilibrium and "check_stack" not in getattr(chosen, "keywords", {}):
-        chosen = partial(equilibrium, **getattr(chosen, "keywords", {}), check_stack=True)
+    if function is equilibrium:
+        bound: dict[str, object] = getattr(chosen, "keywords", {})
+        chosen = make_rule("equilibrium", **({"check_stack": True} | bound))
     stack, load = _stack(boxes, weights, heights, gaps)
     if weight is not None and not 0 < weight < float("inf"):
         raise ValueError(f"weight {weight!r}: needs a positive number")
