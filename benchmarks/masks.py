@@ -52,16 +52,16 @@ def literal_algorithm_1(
             if not held.any():
                 continue
             if squares:
-                points, centre = 2 * corners(held), (float(w), float(d))
+                points, centre = (2 * corners(held)).astype(np.int32), (float(w), float(d))
             else:
-                points, centre = np.argwhere(held), (w / 2, d / 2)
-            hull = cv2.convexHull(points.astype(np.int32))
+                points, centre = np.argwhere(held).astype(np.int32), (w / 2, d / 2)
+            hull = cv2.convexHull(points)
             side = cv2.pointPolygonTest(hull, centre, False)
             mask[x, y] = side > 0 if squares else side >= 0
     return mask
 
 
-def against_the_literal_reading(states: int = 6) -> None:
+def against_the_literal_reading(states: int = 32) -> None:
     """Figure 1."""
     size, sides = LARGE
     game = in_play(states, LARGE, steps=12)

@@ -373,8 +373,9 @@ def _numbers(values: ArrayLike, source: str) -> NDArray[np.float64]:
         array = np.asarray(values)
         if array.dtype.kind in "iuf":
             return array.astype(np.float64)
-    except ValueError:
-        pass  # rows of unequal length: found below
+    except ValueError as error:
+        if not isinstance(values, Iterable):
+            raise ValueError(f"{source}: needs numbers ({error})") from None
     rows = values if isinstance(values, Iterable) else [values]
     for number, row in enumerate(rows):
         if np.shape(row) != (3,) or np.asarray(row).dtype.kind not in "iuf":

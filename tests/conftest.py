@@ -53,7 +53,7 @@ def random_maps(
 ) -> Bins:
     """N bins in which boxes were dropped anywhere, standing or not."""
 
-    def anywhere(bins: Bins, item) -> torch.Tensor:  # type: ignore[no-untyped-def]
+    def anywhere(bins: Bins, item) -> torch.Tensor:
         from marl_pack.stability.hull_torch import fits, resting_height
 
         rest = resting_height(bins.heightmap, item.sides)

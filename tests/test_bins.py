@@ -83,7 +83,7 @@ def test_orientations_are_the_six_permutations_in_turned_pairs() -> None:
 @pytest.mark.parametrize("size", [(0, 5, 5), (5, 5), (5, 5.5, 5), (5, 5, 16384)])
 def test_an_impossible_bin_is_refused(size: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"bin (size|height)"):
-        state.empty(1, size)  # type: ignore[arg-type]
+        state.empty(1, size)
 
 
 def test_cleared_bins_are_empty_and_the_others_untouched() -> None:

@@ -22,7 +22,7 @@ from marl_pack.packing import Packing
 BIN = (10, 10, 10)
 
 
-def sequence(stream, seed: int, episode: int, length: int) -> list[list[int]]:  # type: ignore[no-untyped-def]
+def sequence(stream, seed: int, episode: int, length: int) -> list[list[int]]:
     state = stream.start(seed, torch.tensor([episode]))
     return [stream.item(state, torch.tensor([t]))[0][0].tolist() for t in range(length)]
 
@@ -74,7 +74,7 @@ def test_cuts_replayed_through_the_masks_fill_the_bin(
     order: int, size: tuple[int, int, int], sides: tuple[int, int]
 ) -> None:
     n = 20
-    boxes = cut(size, order, 3, torch.arange(n), sides)  # type: ignore[arg-type]
+    boxes = cut(size, order, 3, torch.arange(n), sides)
     edges = boxes[..., 3:][boxes[..., 3] > 0]
     assert int(edges.min()) >= sides[0]
     assert int(edges.max()) <= sides[1]

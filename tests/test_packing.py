@@ -171,13 +171,13 @@ def test_an_action_out_of_range_is_refused(orientation: int, cell: int) -> None:
 def test_an_episode_that_cannot_begin_is_skipped_or_over() -> None:
     rows = [[[2, 2, 9]], [[3, 3, 3]], [[2, 9, 2]], [[4, 4, 4]]]
     arguments = {"size": (9, 5, 5), "items": rows, "orientations": (0,)}
-    game = Packing(1, **arguments)  # type: ignore[arg-type]
+    game = Packing(1, **arguments)
     seen = []
     for _ in range(4):
         seen.append(int(game.items[0, 0]))
         game.place(torch.tensor([0]), torch.tensor([0]))
     assert seen == [3, 4, 3, 4]
-    still = Packing(4, auto_reset=False, **arguments)  # type: ignore[arg-type]
+    still = Packing(4, auto_reset=False, **arguments)
     assert still.alive.tolist() == [False, True, False, True]
     # A margin that some items can never meet does not stop a long run.
     game, policy = Packing(64, rule_parameters={"margin": 1.0}), make_policy("random")
@@ -241,7 +241,7 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
 )
 def test_what_cannot_be_played_is_refused(arguments: dict[str, object], why: str) -> None:
     with pytest.raises(ValueError, match=why):
-        Packing(**({"n": 2} | arguments))  # type: ignore[arg-type]
+        Packing(**({"n": 2} | arguments))
 
 
 def test_a_large_and_a_flat_bin_are_played() -> None:
@@ -301,7 +301,7 @@ def test_heuristics_take_the_place_their_rule_says() -> None:
 
 def test_the_papers_tables_heuristics_are_reproduced_on_the_published_sequences(
     data_folder,
-) -> None:  # type: ignore[no-untyped-def]
+) -> None:
     from marl_pack.items import load
 
     for file, low, high in (("rs.npz", 0.685, 0.695), ("cut_1.npz", 0.750, 0.762)):

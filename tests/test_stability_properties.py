@@ -63,7 +63,7 @@ def expected(
         [
             [
                 reference.window_mask(
-                    lambda x, y, b=b, a=a, w=w, d=d: stands(b, a, x, y, w, d),  # type: ignore[misc]
+                    lambda x, y, b=b, a=a, w=w, d=d: stands(b, a, x, y, w, d),
                     bins.heightmap[b].numpy(),
                     (w, d, h),
                     bins.height,
@@ -96,7 +96,7 @@ def test_hull_masks_equal_the_reference_cell_by_cell(
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
         window = np.s_[b, x : x + w, y : y + d]
         centre = tuple(item.centres()[b, a].tolist())
-        return reference.hull(bins.heightmap.numpy()[window], holds.numpy()[window], centre, margin)  # type: ignore[arg-type]
+        return reference.hull(bins.heightmap.numpy()[window], holds.numpy()[window], centre, margin)
 
     want = expected(bins, item, stands)
     assert (make_rule(bearing, margin=margin)(bins, item).numpy() == want).all()
@@ -208,7 +208,7 @@ def assert_order(bins: Bins, item: Candidates) -> tuple[int, int, int, int]:
     assert not (alpha & ~load).any()
     assert not (load & ~exact).any()
     assert not (exact & ~one).any()
-    return tuple(int(m.sum()) for m in (alpha, load, exact, one))  # type: ignore[return-value]
+    return tuple(int(m.sum()) for m in (alpha, load, exact, one))
 
 
 @pytest.mark.parametrize("rule", ["hull_alpha", "lbcp", "equilibrium"])
@@ -267,7 +267,7 @@ def test_sound_rules_hold_whatever_the_centre_of_mass_is_if_it_is_known(rule: st
     generator = torch.Generator().manual_seed(13)
     for step in range(15):
         item = off_centre(some_items(60, (1, 5), 100 + step), step)
-        item = Candidates(item.sides[:, :1], item.com[:, :1])  # type: ignore[index]
+        item = Candidates(item.sides[:, :1], item.com[:, :1])
         allowed = bound(bins, item)[:, 0].flatten(1)
         cell = torch.multinomial(allowed.float() + 1e-12, 1, generator=generator)[:, 0]
         stands = allowed.gather(1, cell[:, None])

@@ -20,7 +20,7 @@ def ask(rule: str, bins: Bins, item: tuple[int, int, int], **parameters: object)
         item,
         bins.height,
         boxes_of(bins, 0),
-        **parameters,  # type: ignore[arg-type]
+        **parameters,
     )
 
 
@@ -263,7 +263,7 @@ def test_what_cannot_be_is_refused(change: dict[str, object], why: str) -> None:
         "bin_height": 6,
     }
     with pytest.raises(ValueError, match=why):
-        stable_mask(**(arguments | change))  # type: ignore[arg-type]
+        stable_mask(**(arguments | change))
 
 
 @pytest.mark.parametrize("rule", ["lbcp", "equilibrium"])
