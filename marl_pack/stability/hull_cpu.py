@@ -145,6 +145,55 @@ def inside(lo: Any, hi: Any, upper: Any, lower: Any, x: float, y: float, margin:
 
 
 @njit(cache=True)
+def _middle_inside(lo: Any, hi: Any, d: int) -> bool:
+    """:func:`inside` for the window's middle and no margin, without building the hull.
+
+    Seen from the middle, the hull passes above it iff the steepest rise to a corner on its left
+    and the steepest to one on its right add up to more than 0 (or a corner stands right above);
+    likewise below. In half cells all numbers are whole, so fractions are compared exactly.
+    """
+    w = lo.size
+    for side in range(2):
+        left_rise, left_run, right_rise, right_run = 0, 0, 0, 0
+        passes = False
+        for row in range(w):
+            if hi[row] < lo[row]:
+                continue
+            rise = 2 * hi[row] + 2 - d if side == 0 else d - 2 * lo[row]
+            for x in (2 * row - w, 2 * row + 2 - w):
+                if x < 0:
+                    if left_run == 0 or rise * left_run > left_rise * -x:
+                        left_rise, left_run = rise, -x
+                elif x > 0:
+                    if right_run == 0 or rise * right_run > right_rise * x:
+                        right_rise, right_run = rise, x
+                elif rise > 0:
+                    passes = True
+        if left_run == 0 or right_run == 0:
+            return False
+        if not passes and left_rise * right_run + right_rise * left_run <= 0:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _mark_neighbours(levels: Any, top: int, following: Any, preceding: Any) -> None:
+    """For every cell of [W, D] the nearest one of level ``top`` from it on, and up to it."""
+    depth = levels.shape[1]
+    for x in range(levels.shape[0]):
+        last = -1
+        for y in range(depth):
+            if levels[x, y] == top:
+                last = y
+            preceding[x, y] = last
+        last = depth
+        for y in range(depth - 1, -1, -1):
+            if levels[x, y] == top:
+                last = y
+            following[x, y] = last
+
+
+@njit(cache=True)
 def _solve_undecided(
     codes: Any, best: Any, levels: Any, w: int, d: int, x: float, y: float, margin: float,
     scratch: Any, out: Any,
@@ -156,23 +205,39 @@ def _solve_undecided(
         w, d: the windows' size. x, y: the centre of mass in them. scratch: int64 [3, 2W + 2, 2].
         out: uint8 [W, D], written at the undecided positions.
     """
-    depth = levels.shape[1]
+    width, depth = levels.shape
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
     upper, lower = scratch[1], scratch[2]
-    for position in range((levels.shape[0] - w) * depth + depth - d + 1):
+    middle = margin == 0.0 and 2 * x == w and 2 * y == d
+    # Large windows come in clusters over the same level: mark its cells once, then look up.
+    marks = np.empty((2, width, depth) if w * d > 64 else (2, 0, 0), np.int16)
+    following, preceding = marks[0], marks[1]
+    marked = -1
+    for position in range((width - w) * depth + depth - d + 1):
         if codes[position] != UNDECIDED:
             continue
         cx, cy = position // depth, position % depth
         top = best[position]
-        for i in range(w):
-            row = levels[cx + i, cy : cy + d]
-            first, last = d, -1
-            for j in range(d):
-                if row[j] == top:
-                    first = min(first, j)
-                    last = j
-            lo[i], hi[i] = first, last
-        out[cx, cy] = inside(lo, hi, upper, lower, x, y, margin)
+        if w * d > 64:
+            if marked != top:
+                _mark_neighbours(levels, top, following, preceding)
+                marked = top
+            for i in range(w):
+                lo[i] = following[cx + i, cy] - cy
+                hi[i] = preceding[cx + i, cy + d - 1] - cy
+        else:
+            for i in range(w):
+                row = levels[cx + i, cy : cy + d]
+                first, last = d, -1
+                for j in range(d):
+                    if row[j] == top:
+                        first = min(first, j)
+                        last = j
+                lo[i], hi[i] = first, last
+        if middle:
+            out[cx, cy] = _middle_inside(lo, hi, d)
+        else:
+            out[cx, cy] = inside(lo, hi, upper, lower, x, y, margin)
 
 
 @njit(cache=True)
