@@ -1,0 +1,123 @@
+"""A small dense simplex for the linear programs of static equilibrium.
+
+They have a dozen rows and a few dozen columns, are degenerate, and come by the thousand: the call
+of a library costs a hundred times what the pivots do.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
+    table[row] /= table[row, column]
+    for i in range(table.shape[0]):
+        factor = table[i, column]
+        if i != row and factor != 0.0:
+            for j in range(table.shape[1]):
+                table[i, j] -= factor * table[row, j]
+    basis[row] = column
+
+
+@njit(cache=True)
+def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
+    """Minimise the last row's objective by the simplex method, until it is below ``-enough``.
+
+    Largest coefficient first, and among tied rows (the moments' right-hand sides are all 0) the
+    largest pivot, which keeps the numbers sound; Bland's rule once that might cycle.
+
+    Returns:
+        Whether it came to an end.
+    """
+    rows = basis.size
+    for iteration in range(200 * rows + 1000):
+        if -table[rows, -1] < -enough:
+            return True
+        bland = iteration > 5 * rows + 50
+        column, least = -1, -1e-10
+        for j in range(columns):
+            if table[rows, j] < least:
+                column = j
+                if bland:
+                    break
+                least = table[rows, j]
+        if column < 0:
+            return True
+        row, best = -1, np.inf
+        for i in range(rows):
+            pivot = table[i, column]
+            if pivot > 1e-9:
+                ratio = max(table[i, -1], 0.0) / pivot
+                tied = row >= 0 and ratio <= best + 1e-13
+                if bland:
+                    better = tied and basis[i] < basis[row]
+                else:
+                    better = tied and pivot > table[row, column]
+                if ratio < best - 1e-13 or better:
+                    row, best = i, ratio
+        if row < 0:
+            return True
+        _pivot(table, basis, row, column)
+    return False
+
+
+@njit(cache=True)
+def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
+    """``max t, a f = weight, f ≥ t`` for ``a`` [R, m] of full row rank and ``weight`` [R] ≥ 0.
+
+    Returns:
+        The optimum, or the first value found above ``enough``; -inf if no ``f ≥ 0`` solves it. And
+        whether the forces, put back into the equations, bear it out: false where rounding errors
+        have spoilt the tableau.
+    """
+    rows, columns = a.shape
+    table = np.zeros((rows + 1, columns + 2))  # g, t, right-hand side; objective in the last row
+    basis = np.empty(rows, np.int64)
+    for i in range(rows):
+        for j in range(columns):
+            table[i, j] = a[i, j]
+            table[i, columns] += a[i, j]
+        table[i, columns + 1] = weight[i]
+        basis[i] = columns + 1 + i  # an artificial variable, never stored
+        table[rows] -= table[i]
+    sound = _optimise(table, basis, columns + 1, np.inf)
+    missing = -table[rows, columns + 1]
+    feasible = missing <= 1e-9
+    if feasible:
+        for i in range(rows):  # drive artificial variables, now zero, out of the basis
+            if basis[i] > columns:
+                best = 0
+                for j in range(columns + 1):
+                    if abs(table[i, j]) > abs(table[i, best]):
+                        best = j
+                if abs(table[i, best]) > 1e-9:
+                    _pivot(table, basis, i, best)
+                else:
+                    sound = False
+        table[rows] = 0.0
+        table[rows, columns] = -1.0
+        for i in range(rows):
+            if basis[i] == columns:
+                table[rows] += table[i]
+        sound = _optimise(table, basis, columns + 1, enough) and sound
+        missing = 0.0
+
+    force, t = np.zeros(columns), 0.0
+    for i in range(rows):
+        if basis[i] < columns:
+            force[basis[i]] += table[i, columns + 1]
+        elif basis[i] == columns:
+            t = table[i, columns + 1]
+    force += t
+    lacking = 0.0
+    for i in range(rows):
+        rest = weight[i]
+        for j in range(columns):
+            rest -= a[i, j] * force[j]
+        lacking += abs(rest)
+    sound = sound and abs(lacking - missing) < 1e-7 and force.min() > -1e-9
+    return (t if feasible else -np.inf), sound
