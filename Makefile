@@ -33,12 +33,19 @@ bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 play: $(STAMP)  ## one game by a heuristic, shown and drawn
 	$(BIN)/python -m marl_pack.play --policy dblf --seed 0 --picture play.png
 
-train: play  ## the main job
+train: $(STAMP)  ## train for a few minutes, then compare with heuristics
+	@if [ -f runs/quick/latest.pt ]; then \
+	  $(BIN)/python -m marl_pack.train --resume runs/quick; \
+	else \
+	  $(BIN)/python -m marl_pack.train --config configs/quick.yaml --output.name quick; \
+	fi
+	$(BIN)/python -m marl_pack.evaluate --policy runs/quick dblf random --items rs --seed 1
 
 benchmark: $(STAMP)  ## every figure of docs/results.md on speed
 	$(BIN)/python -m benchmarks.masks
 	$(BIN)/python -m benchmarks.rules
 	$(BIN)/python -m benchmarks.game
+	$(BIN)/python -m benchmarks.training
 
 clean:  ## forget compiled code and caches
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.timing import devices, show
 from marl_pack import env_aec
-from marl_pack.agents.heuristics import random_policy
+from marl_pack.agents.heuristics import make_policy
 from marl_pack.packing import Packing
 
 OTHERS = (
@@ -30,7 +30,7 @@ def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> f
     """Items placed per second of CPU time (of wall time on CUDA): the best of ``repeats``."""
     on_cpu = game.device.type == "cpu"
     clock = time.process_time if on_cpu else time.perf_counter
-    policy = random_policy(0, game.device)
+    policy = make_policy("random", 0, game.device)
     for _ in range(30):
         game.place(*policy(game))
     best = 0.0

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -26,8 +25,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from scipy import stats
 
-from marl_pack.agents.heuristics import HEURISTICS, make_policy
-from marl_pack.agents.policy import Policy
+from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
+from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.files import check_writable, write_atomically
 from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.stability import RULES, in_equilibrium
@@ -113,22 +113,34 @@ def strict_equilibrium(
     return stands
 
 
-def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, Any]:
-    """The figures of the table; utilization in shares of the bin's volume.
+def mean_utilization(played: Episodes) -> dict[str, Any]:
+    """Mean utilization with its 95 % interval (Student's, over episodes), and items packed.
 
-    The interval is Student's, over episodes; a single one has neither interval nor std (None).
+    Keys ``episodes``, ``utilization``, ``low``, ``high``, ``std``, ``packed``; shares of the bin's
+    volume. A single episode has no interval and no std (None).
     """
     u = played.utilization
-    interval: list[float] | None = None
+    low = high = std = None
     if len(u) > 1:
         bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
-        interval = [float(bounds.low), float(bounds.high)]
+        low, high, std = float(bounds.low), float(bounds.high), float(u.std(ddof=1))
     return {
         "episodes": len(u),
         "utilization": float(u.mean()),
-        "interval": interval,
-        "std": float(u.std(ddof=1)) if len(u) > 1 else None,
+        "low": low,
+        "high": high,
+        "std": std,
         "packed": float(played.packed.mean()),
+    }
+
+
+def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, Any]:
+    """The figures of the table; utilization in shares of the bin's volume."""
+    found = mean_utilization(played)
+    low, high = found.pop("low"), found.pop("high")
+    return {
+        **found,
+        "interval": None if low is None else [low, high],
         "decisions_per_second": float(played.packed.sum() / max(played.seconds, 1e-9)),
         "strict_equilibrium": float(stands.mean()),
     }
@@ -137,7 +149,7 @@ def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, Any]:
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
     """Print the table, a row for each policy."""
     table = Table(title=title)
-    table.add_column("policy", no_wrap=True)
+    table.add_column("policy", overflow="fold")
     for column in ("episodes", "utilization %", "std", "items", "dec./s", "strict"):
         table.add_column(column, justify="right", no_wrap=True)
     for name, row in rows.items():
@@ -159,24 +171,6 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
         "strict: final stacks in strict equilibrium as a whole"
     )
-
-
-def check_writable(path: Path) -> None:
-    """Raise ValueError if a file cannot be written there."""
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; name a file")
-
-
-def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
-    """Write a file under another name and move it into place, so that it is whole or not there."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def save_stacks(path: Path, played: Episodes) -> None:
@@ -225,8 +219,15 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = options.add_argument
-    add("--policy", nargs="+", default=["dblf"], metavar="NAME",
-        help=f"one or more of {', '.join(HEURISTICS)}")  # fmt: skip
+    add("--policy", nargs="+", metavar="NAME",
+        help=f"one or more of {', '.join(POLICIES)}, runs' folders or checkpoints "
+             "(default: dblf)")  # fmt: skip
+    add("--orientation", metavar="NAME",
+        help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, a "
+             "run's folder or a checkpoint")  # fmt: skip
+    add("--placement", metavar="NAME",
+        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a run's "
+             "folder or a checkpoint")  # fmt: skip
     add("--items", default="rs", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
         help="bin size in cells (default: the file's own, else 10 10 10)")  # fmt: skip
@@ -237,6 +238,8 @@ def parser() -> argparse.ArgumentParser:
     add("--thresholds", choices=["paper", "code"], help="of the rule area_ratio")
     add("--orientations", nargs="+", type=int, default=list(ALL_ORIENTATIONS), metavar="O",
         help="orientations that may be chosen, of 0 … 5")  # fmt: skip
+    add("--no-orientation-mask", action="store_true",
+        help="let orientations without a legal cell be chosen; that ends the episode")  # fmt: skip
     add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
     add("--seed", type=int, default=0, help="of generated items and of random play")
     add("--device", default="cpu", help="cpu, cuda, cuda:1, …")
@@ -244,6 +247,35 @@ def parser() -> argparse.ArgumentParser:
     add("--json", type=Path, metavar="FILE", help="write the figures there")
     add("--save-stacks", type=Path, metavar="FILE", help="write the packed boxes there (.npz)")
     return options
+
+
+def choose_policies(arguments: argparse.Namespace, console: Console) -> dict[str, Policy]:
+    """The policies that the options name, by the name of their row.
+
+    Raises:
+        ValueError, FileNotFoundError: if there is none of that name.
+    """
+    pair = arguments.orientation, arguments.placement
+    if (pair[0] is None) != (pair[1] is None):
+        raise ValueError("--orientation and --placement go together: name both agents")
+    names = arguments.policy or ([] if pair[0] else ["dblf"])
+    if all(name in POLICIES for name in names) and pair == (None, None):
+        return {n: make_policy(n, arguments.seed, arguments.device) for n in names}
+    # Only learned agents need rsl_rl.
+    from marl_pack.agents import checkpoint
+
+    where = arguments.device, arguments.seed
+    policies = {name: checkpoint.find_policy(name, *where) for name in names}
+    if pair[0] is not None:
+        policies[f"{pair[0]} + {pair[1]}"] = in_turns(
+            checkpoint.find_orientation_agent(pair[0], *where),
+            checkpoint.find_placement_agent(pair[1], *where),
+        )
+    for source in dict.fromkeys((*names, *pair)):
+        if source is not None and source not in ORIENTATION_AGENTS:
+            trained = checkpoint.trained_on(source)
+            console.print(f"{source}: trained on {trained}", soft_wrap=True)
+    return policies
 
 
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
@@ -256,7 +288,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         torch.empty(0, device=arguments.device)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"--device {arguments.device}: {error}") from None
-    policies = {n: make_policy(n, arguments.seed, arguments.device) for n in arguments.policy}
+    policies = choose_policies(arguments, console)
     if arguments.save_stacks and len(policies) > 1:
         raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
     for path in (arguments.json, arguments.save_stacks):
@@ -277,8 +309,9 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     def game(n: int, first_episode: int) -> Packing:
         return Packing(
             n, size, stream, rule=arguments.rule, rule_parameters=parameters,
-            orientations=arguments.orientations, device=arguments.device, seed=arguments.seed,
-            first_episode=first_episode, auto_reset=False,
+            orientations=arguments.orientations,
+            mask_orientations=not arguments.no_orientation_mask, device=arguments.device,
+            seed=arguments.seed, first_episode=first_episode, auto_reset=False,
         )  # fmt: skip
 
     rows = {}
@@ -306,6 +339,8 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         title += f" ({', '.join(f'{k} {v}' for k, v in parameters.items())})"
     if set(arguments.orientations) != set(ALL_ORIENTATIONS):
         title += f", orientations {sorted(set(arguments.orientations))}"
+    if arguments.no_orientation_mask:
+        title += ", no mask of orientations"
     show(rows, title, console)
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
 
 MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no place, before the game gives up."""
+
+BIN_FIELDS = tuple(field.name for field in fields(state.Bins) if field.name != "height")
+GAME_FIELDS = ("items", "weights", "episode", "t", "stream_state", "lost")
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,10 @@ class Packing:
         items: int16 [N, 3], the visible item's own sides w, d, h.
         weights: float64 [N], its weight.
         mask: bool [N, 6, W, D], where it may be set down in each orientation.
-        orientation_mask: bool [N, 6], the orientations with a legal cell.
+        orientation_mask: bool [N, 6], the orientations that may be chosen: those with a legal cell.
         alive: bool [N], false where an episode has ended (only without ``auto_reset``).
         episode, t: int64 [N], number of the episode played in each bin and items placed in it.
+        bin_height: int16 [N, 1], H.
 
     Args:
         n: number of bins N.
@@ -87,6 +91,9 @@ class Packing:
         alpha: weight of the volume gained, Eq. 5.
         beta: weight of the space wasted, Eq. 5.
         com_offset: the items' centre of mass from their geometric centre, in fractions of w, d, h.
+        mask_orientations: whether orientations without a legal cell are excluded (the paper's
+            way). Else all allowed ones may be chosen, and a choice without a cell ends the episode
+            with nothing placed and no reward.
         auto_reset: begin a new episode in a bin as soon as one ends there. Without it a finished
             bin stays as it is, its mask stays empty and what is played there is ignored.
         device: where everything happens.
@@ -110,6 +117,7 @@ class Packing:
         alpha: float = 1.0,
         beta: float = 1.0,
         com_offset: tuple[float, float, float] = NO_OFFSET,
+        mask_orientations: bool = True,
         auto_reset: bool = True,
         device: torch.device | str = "cpu",
         seed: int = 0,
@@ -134,11 +142,15 @@ class Packing:
         if not (math.isfinite(self.alpha) and math.isfinite(self.beta)):
             raise ValueError(f"alpha = {alpha}, beta = {beta}: need finite numbers")
         self.com_offset = check_com_offset(com_offset)
-        self.auto_reset = auto_reset
+        self.mask_orientations, self.auto_reset = mask_orientations, auto_reset
         self._index = torch.arange(n, device=self.device)
+        self._allowed = torch.tensor(
+            [o in chosen for o in ALL_ORIENTATIONS], device=self.device
+        )  # [6]
         self._banned = [o for o in ALL_ORIENTATIONS if o not in chosen]
         width, depth, height = self.size
         self.volume = width * depth * height
+        self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.alpha / self.volume, self.beta / self.volume
         most = self.volume // self.stream.smallest
         if self.stream.longest is not None:
@@ -157,6 +169,7 @@ class Packing:
             self.seed = int(seed)
         self.episode = self._index + first_episode
         self.t = torch.zeros_like(self.episode)
+        self.lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
         state.clear(self.bins, slice(None))
         self.stream_state = self.stream.start(self.seed, self.episode)
         self.items, self.weights = self.stream.item(self.stream_state, self.t)
@@ -208,8 +221,11 @@ class Packing:
         if check:
             self._check(orientation, cell)
         sides = self._turned(orientation)
-        if not self.auto_reset:
-            sides = torch.where(alive[:, None], sides, 0)
+        if not self.mask_orientations:
+            possible = orientations_with_a_cell(self.mask)[self._index, orientation]
+            self.lost = self.lost | (alive & ~possible)
+        if not (self.auto_reset and self.mask_orientations):
+            sides = torch.where((alive & ~self.lost)[:, None], sides, 0)
         com = None
         if any(self.com_offset):
             com = self.candidates(self.items, self.weights).centres()[self._index, orientation]
@@ -219,7 +235,7 @@ class Packing:
         filled, placed = self.bins.filled.clone(), self.bins.count.clone()
 
         # A finished bin keeps the item that found no place, and so its empty mask.
-        self.t = self.t + alive
+        self.t = self.t + (alive & ~self.lost)
         self.items, self.weights = self.stream.item(self.stream_state, self.t)
         self._look()
         done = alive & ~self.alive
@@ -227,12 +243,42 @@ class Packing:
             self._begin(done.nonzero().squeeze(1))
         return Outcome(reward, done, filled, placed, self.volume)
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that the rest of the game depends on, to be kept and loaded again."""
+        tensors = dict(zip(BIN_FIELDS, self.bins.tensors(), strict=True))
+        tensors |= {name: getattr(self, name) for name in GAME_FIELDS}
+        return {name: tensor.clone() for name, tensor in tensors.items()}
+
+    def load_state_dict(self, kept: Mapping[str, Tensor]) -> None:
+        """Go on from where :meth:`state_dict` was taken of a game made with the same arguments.
+
+        Raises:
+            ValueError: if it is another game's.
+        """
+        own = self.state_dict()
+        for name, tensor in own.items():
+            if name not in kept or kept[name].shape != tensor.shape:
+                found = list(kept[name].shape) if name in kept else "missing"
+                raise ValueError(
+                    f"state of another game: {name} is {found}, needs {list(tensor.shape)}"
+                )
+        for name, tensor in zip(BIN_FIELDS, self.bins.tensors(), strict=True):
+            tensor.copy_(kept[name])
+        for name in GAME_FIELDS:
+            setattr(self, name, kept[name].to(own[name]).clone())
+        self._look()
+
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
         """Raise ValueError if a choice in a living bin is not legal."""
         cells = self.size[0] * self.size[1]
         real = (orientation >= 0) & (orientation < len(ORIENTATIONS)) & (cell >= 0) & (cell < cells)
         turned, spot = torch.where(real, orientation, 0), torch.where(real, cell, 0)
-        wrong = self.alive & ~(real & self.mask.flatten(2)[self._index, turned, spot])
+        legal = self.mask.flatten(2)[self._index, turned, spot]
+        if not self.mask_orientations:
+            legal |= self.orientation_mask[self._index, turned] & ~self.mask[
+                self._index, turned
+            ].flatten(1).any(1)
+        wrong = self.alive & ~(real & legal)
         if bool(wrong.any()):
             i = int(wrong.nonzero()[0])
             x, y = divmod(int(cell[i]), self.size[1])
@@ -244,8 +290,17 @@ class Packing:
     def _look(self) -> None:
         """Make the masks of the items that have come; a bin where none is legal has ended."""
         self.mask = self.masks(self.bins, self.items, self.weights)
-        self.orientation_mask = orientations_with_a_cell(self.mask)
-        self.alive = self.orientation_mask.any(1)
+        if not self.mask_orientations:
+            self.mask &= ~self.lost[:, None, None, None]
+        self.orientation_mask, self.alive = self._choices(self.mask)
+
+    def _choices(self, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """The orientations that may be chosen [K, 6], and whether the episode goes on [K]."""
+        possible = orientations_with_a_cell(mask)
+        alive = possible.any(1)
+        if not self.mask_orientations:
+            possible = self._allowed & alive[:, None]
+        return possible, alive
 
     def _begin(self, which: Tensor) -> None:
         """Begin the next episode in the bins ``which`` (int64 [K]) that has a legal first item.
@@ -258,14 +313,13 @@ class Packing:
                 return
             self.episode[which] += self.n
             self.t[which] = 0
+            self.lost[which] = False
             state.clear(self.bins, which)
             self.stream_state[which] = self.stream.start(self.seed, self.episode[which])
             items, weights = self.stream.item(self.stream_state[which], self.t[which])
             mask = self.masks(self._empty[: len(which)], items, weights)
-            orientation_mask = orientations_with_a_cell(mask)
             self.items[which], self.weights[which], self.mask[which] = items, weights, mask
-            self.orientation_mask[which] = orientation_mask
-            self.alive[which] = orientation_mask.any(1)
+            self.orientation_mask[which], self.alive[which] = self._choices(mask)
             which = which[~self.alive[which]]
         if len(which):
             raise ValueError(

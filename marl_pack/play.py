@@ -14,9 +14,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from marl_pack.agents.heuristics import HEURISTICS, make_policy
+from marl_pack.agents.heuristics import POLICIES, make_policy
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.evaluate import check_writable, write_atomically
+from marl_pack.files import check_writable, write_atomically
 from marl_pack.items import GENERATED, choose_stream
 from marl_pack.packing import Packing
 from marl_pack.stability import RULES, in_equilibrium
@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = options.add_argument
-    add("--policy", default="dblf", choices=list(HEURISTICS), help="who plays both agents")
+    add("--policy", default="dblf", choices=list(POLICIES), help="who plays both agents")
     add("--items", default="rs", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
         help="bin size in cells (default: the file's own, else 10 10 10)")  # fmt: skip

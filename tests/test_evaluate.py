@@ -113,7 +113,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        ("--policy nobody", "unknown policy 'nobody'"),
+        ("--policy nobody", "'nobody' is neither"),
         ("--items missing.npz", "no such file"),
         ("--items sr", "unknown items|no such file"),
         ("--episodes 0", "--episodes 0"),

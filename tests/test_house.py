@@ -7,11 +7,11 @@ PACKAGE = Path(__file__).parent.parent / "marl_pack"
 
 # A module may import from its own floor and from those before it.
 FLOORS = (
-    ("bins", "item_files", "items", "render"),
+    ("bins", "files", "item_files", "items", "render"),
     ("stability",),
     ("packing",),
-    ("env_aec", "agents"),
-    ("evaluate", "play"),
+    ("env_aec", "vec_env", "agents"),
+    ("config", "evaluate", "export", "play", "train"),
 )
 
 

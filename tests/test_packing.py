@@ -4,7 +4,7 @@ import torch
 from conftest import boxes_of
 
 from marl_pack import bins as state
-from marl_pack.agents.heuristics import HEURISTICS, make_policy
+from marl_pack.agents.heuristics import POLICIES, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.items import check_items
@@ -262,7 +262,7 @@ def test_draw_is_uniform_over_the_true_entries() -> None:
     assert (chosen[1::2] == 0).all()
 
 
-@pytest.mark.parametrize("name", HEURISTICS)
+@pytest.mark.parametrize("name", POLICIES)
 def test_heuristics_choose_what_the_mask_allows(name: str) -> None:
     game, policy = Packing(32, (9, 7, 8), seed=8, auto_reset=False), make_policy(name, 3)
     while game.alive.any():
@@ -310,3 +310,25 @@ def test_the_papers_tables_heuristics_are_reproduced_on_the_published_sequences(
         while game.alive.any():
             outcome = game.place(*make_policy("dblf")(game))
         assert low < float(outcome.utilization.mean()) < high
+
+
+def test_an_unmasked_orientation_without_a_cell_ends_the_episode_with_nothing_placed() -> None:
+    """A 1 × 1 × 3 bin beside items 1 × 1 × 2 and 1 × 1 × 1: lying, the first fits nowhere."""
+    for auto_reset in (False, True):
+        game = Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False,
+                       auto_reset=auto_reset)  # fmt: skip
+        assert game.orientation_mask.all()
+        upright, lying = 0, int((~game.mask[0].flatten(1).any(1)).nonzero()[0])
+        outcome = game.place(torch.tensor([upright, lying]), torch.tensor([0, 0]))
+        assert outcome.done.tolist() == [False, True]
+        assert outcome.reward.tolist() == pytest.approx([2 / 3, 0])
+        assert outcome.placed.tolist() == [1, 0]
+        if auto_reset:
+            assert game.alive.all()
+            assert game.t.tolist() == [1, 0]
+            continue
+        assert game.alive.tolist() == [True, False]
+        assert not game.mask[1].any()
+        outcome = game.place(torch.tensor([upright, lying]), torch.tensor([0, 0]))
+        assert outcome.done.tolist() == [True, False]
+        assert game.bins.filled.tolist() == [3, 0]

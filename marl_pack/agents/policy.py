@@ -9,18 +9,37 @@ from torch import Tensor
 
 from marl_pack.packing import Packing
 
-Policy = Callable[[Packing], tuple[Tensor, Tensor]]
-"""``game -> (orientation int64 [N], cell int64 [N])``, legal wherever ``game.alive``.
+Choice = tuple[Tensor, Tensor]
+"""(orientation int64 [N], cell int64 [N])."""
+
+Policy = Callable[[Packing], Choice]
+"""``game -> (orientation, cell)``, legal wherever ``game.alive``.
 
 Networks, heuristics and random play are all of this form, so one loop plays them all."""
 
+OrientationAgent = Callable[[Packing], Tensor]
+"""``game -> orientation int64 [N]``: the first agent alone."""
 
-def draw(mask: Tensor, generator: torch.Generator) -> Tensor:
+PlacementAgent = Callable[[Packing, Tensor], Tensor]
+"""``(game, orientation int64 [N]) -> cell int64 [N]``: the second agent alone."""
+
+
+def in_turns(orientation_agent: OrientationAgent, placement_agent: PlacementAgent) -> Policy:
+    """The policy of two agents, wherever each comes from."""
+
+    def play(game: Packing) -> Choice:
+        orientation = orientation_agent(game)
+        return orientation, placement_agent(game, orientation)
+
+    return play
+
+
+def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """One index drawn uniformly from the true entries of each row; 0 where there are none.
 
     Args:
         mask: bool [N, K].
-        generator: of the random numbers, on the mask's device.
+        generator: of the random numbers, on the mask's device; torch's global one by default.
 
     Returns:
         int64 [N].

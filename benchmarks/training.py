@@ -1,0 +1,144 @@
+"""How fast does the trainer learn? ``python -m benchmarks.training``.
+
+Items per second of whole PPO iterations, rollout and update, and where the time goes: environment
+with masks, networks (forward, backward, optimiser), rsl_rl's own machinery (storage, minibatches,
+advantages, loss), and the rest.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.timing import devices, show
+from marl_pack.agents.runner import Runner
+from marl_pack.config import parse
+from marl_pack.train import make_runner
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+PARTS = ("environment", "networks", "rsl_rl", "rest")
+
+OTHERS = (
+    ("Zhao 2021, their trainer", "123 – 132"),
+    ("PCT, setting 1", "129 – 138"),
+    ("PCT, setting 2 (no stability)", "246 – 254"),
+)
+"""Steps per CPU-second of other trainers' whole loops, each in its own code, on one core of one
+2-core machine."""
+
+
+class Split:
+    """Time spent in parts of a program, each without what it calls of another part.
+
+    Args:
+        clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.clock = clock
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self.part, self.since = "rest", clock()
+
+    def enter(self, part: str) -> str:
+        """Count from now on for ``part``; returns the one before."""
+        now = self.clock()
+        self.seconds[self.part] += now - self.since
+        before, self.part, self.since = self.part, part, now
+        return before
+
+    def watch(self, owner: Any, name: str, part: str) -> None:
+        """Count what the method ``owner.name`` does for ``part``."""
+        method = getattr(owner, name)
+
+        def watched(*args: Any, **named: Any) -> Any:
+            before = self.enter(part)
+            try:
+                return method(*args, **named)
+            finally:
+                self.enter(before)
+
+        setattr(owner, name, watched)
+
+
+def watched(runner: Runner, split: Split) -> None:
+    """Count the parts of a runner's iterations."""
+    for name in ("step", "orient", "get_observations"):
+        split.watch(runner.env, name, "environment")
+    for ppo in runner.alg.learners.values():
+        for name in ("act", "process_env_step", "compute_returns", "update"):
+            split.watch(ppo, name, "rsl_rl")
+        for model in (ppo.actor, ppo.critic):
+            split.watch(model, "forward", "networks")
+        split.watch(ppo.actor.distribution, "log_prob", "networks")
+        split.watch(ppo.optimizer, "step", "networks")
+        split.watch(ppo.optimizer, "zero_grad", "networks")
+    split.watch(runner.logger, "process_env_step", "rsl_rl")
+
+
+def measure(
+    config_name: str, device: str, bins: int, seconds: float
+) -> tuple[float, dict[str, float]]:
+    """Items per second (CPU seconds; wall seconds on CUDA) and the share of each part."""
+    config, _ = parse([
+        f"--config={CONFIGS / config_name}.yaml", f"--ppo.num_envs={bins}", f"--device={device}",
+        "--evaluation.every=0",
+    ])  # fmt: skip
+    on_cpu = device == "cpu"
+
+    def clock() -> float:
+        if on_cpu:
+            return time.process_time()
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    runner = make_runner(config, None)
+    runner.train(1)
+    items = bins * config.ppo.num_steps_per_env
+    best, done, start = 0.0, 1, clock()
+    while clock() - start < seconds or done < 4:
+        begun = clock()
+        done += 1
+        runner.train(done)
+        best = max(best, items / (clock() - begun))
+    # The split is taken apart, as taking it costs (on CUDA it waits at every call).
+    split = Split(clock)
+    watched(runner, split)
+    backward, clip = torch.Tensor.backward, torch.nn.utils.clip_grad_norm_
+    split.watch(torch.Tensor, "backward", "networks")
+    split.watch(torch.nn.utils, "clip_grad_norm_", "networks")
+    try:
+        split.enter("rest")
+        split.seconds.clear()
+        runner.train(done + 2)
+        split.enter("rest")
+    finally:
+        torch.Tensor.backward = backward  # type: ignore[method-assign]  # as it was
+        torch.nn.utils.clip_grad_norm_ = clip
+    total = sum(split.seconds.values())
+    return best, {part: split.seconds[part] / total for part in PARTS}
+
+
+def main() -> None:
+    """The table."""
+    torch.set_num_threads(1)
+    rows = []
+    for device in devices():
+        for config in ("paper", "rs"):
+            for bins in (256, 1024) if device == "cpu" else (4096, 16384):
+                rate, shares = measure(config, device, bins, 20.0)
+                rows.append(
+                    [f"configs/{config}.yaml, N = {bins:,}", device, f"{rate:,.0f}"]
+                    + [f"{100 * shares[part]:.1f} %" for part in PARTS]
+                )
+    rows += [[name, "cpu, told", rate, "", "", "", ""] for name, rate in OTHERS]
+    columns = ["", "device", "items/s", *PARTS]
+    show("training, 10 × 10 × 10, RS, one core", columns, rows)
+
+
+if __name__ == "__main__":
+    main()

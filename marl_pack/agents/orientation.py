@@ -1,0 +1,55 @@
+"""The orientation agent π_o: sees the bin and the item as it comes, chooses one of six ways.
+
+Its mask excludes the orientations without a legal cell (paper, sec. III-D).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from marl_pack.agents.trunk import Network, pooled_head
+from marl_pack.bins import ORIENTATIONS
+from marl_pack.packing import Packing
+from marl_pack.stability.windows import rest_and_waste
+
+WAYS = len(ORIENTATIONS)
+
+
+def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
+    """What the agent sees of N bins.
+
+    Args:
+        game: the bins.
+        planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`), each for all orientations.
+
+    Returns:
+        ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
+        ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
+        ``rest`` int16, ``waste`` int32 [N, 6, W, D].
+    """
+    seen = {
+        "heightmap": game.bins.heightmap.clone(),
+        "item": game.items,
+        "height": game.bin_height,
+        "mask": game.orientation_mask,
+    }
+    if "mask" in planes:
+        seen["cells"] = game.mask
+    if "rest" in planes or "waste" in planes:
+        sides = game.candidates(game.items, game.weights).sides
+        seen |= under(game, sides, planes)
+    return seen
+
+
+def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tensor]:
+    """The planes ``rest`` and ``waste`` that are asked for, for boxes of ``sides`` [N, A, 3]."""
+    rest, waste = rest_and_waste(game.bins, sides, waste="waste" in planes)
+    made = {"rest": rest, "waste": waste}
+    return {name: made[name] for name in planes if name in made}
+
+
+def make_head(network: Network) -> nn.Module:
+    """Features [B, C, W, D] → logits of the orientations [B, 6]."""
+    return pooled_head(network, WAYS, 0.01)

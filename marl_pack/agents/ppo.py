@@ -1,0 +1,262 @@
+"""PPO for two agents that take turns: one stock rsl_rl ``PPO`` each, driven as if they were one.
+
+Within a step the orientation agent acts on what it sees, then the placement agent on what that
+choice shows it. Both store the same reward and the same end of episode (Eq. 3 – 5), each reckons
+its advantages over its own turns. A frozen agent plays without learning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+from torch import Tensor
+
+from marl_pack.agents import joint
+from marl_pack.agents.checkpoint import find_orientation_agent, find_placement_agent
+from marl_pack.agents.model import Actor, Critic
+from marl_pack.agents.policy import OrientationAgent, PlacementAgent
+from marl_pack.agents.symmetry import SymmetricStorage
+from marl_pack.vec_env import PackingVecEnv
+
+KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
+
+
+class PackingPPO:
+    """What rsl_rl's ``OnPolicyRunner`` takes for a PPO.
+
+    Args:
+        learners: name (``orientation``, ``placement`` or ``joint``) → the agent's PPO.
+        orientation_agent: who orients where no learner does.
+        placement_agent: who places where no learner does.
+        env: the bins.
+        schedules: name → settings of :meth:`anneal` for that learner.
+        iterations: how many there will be, for the schedules.
+    """
+
+    rnd = None  # no exploration bonus; the runner asks
+
+    def __init__(
+        self,
+        learners: Mapping[str, PPO],
+        orientation_agent: OrientationAgent | None,
+        placement_agent: PlacementAgent | None,
+        env: PackingVecEnv,
+        schedules: Mapping[str, Mapping[str, Any]],
+        iterations: int,
+    ) -> None:
+        if not learners:
+            raise ValueError("both agents are frozen: nothing would learn")
+        self.learners = dict(learners)
+        self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
+        self.env = env
+        self.schedules = schedules
+        self.iterations = iterations
+        self.iteration = 0
+
+    # --- the rollout ------------------------------------------------------------------------------
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Both agents' choices, int64 [N, 2]; the learners' are recorded.
+
+        Args:
+            obs: what the environment's ``get_observations`` gave.
+        """
+        if "joint" in self.learners:
+            pair = self.learners["joint"].act(obs).squeeze(1).long()
+            return torch.stack(joint.split(pair, obs["heightmap"][0].numel()), 1)
+        if "orientation" in self.learners:
+            orientation = self.learners["orientation"].act(obs).squeeze(1).long()
+        else:
+            orientation = self._frozen_orientation()
+        if "placement" in self.learners:
+            cell = self.learners["placement"].act(self.env.orient(orientation)).squeeze(1).long()
+        else:
+            assert self.placement_agent is not None
+            cell = self.placement_agent(self.env.game, orientation)
+        return torch.stack((orientation, cell), 1)
+
+    def _frozen_orientation(self) -> Tensor:
+        assert self.orientation_agent is not None
+        return self.orientation_agent(self.env.game)
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
+    ) -> None:
+        """Record the reward that the agents share."""
+        for ppo in self.learners.values():
+            ppo.process_env_step(obs, rewards, dones, extras)
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Advantages of the rollout that ends at ``obs``; there an orientation is drawn."""
+        for name, ppo in self.learners.items():
+            if name != "placement":
+                ppo.compute_returns(obs)
+                continue
+            if "orientation" in self.learners:
+                actor = self.learners["orientation"].actor
+                orientation = actor(obs, stochastic_output=True).squeeze(1).long()
+            else:
+                orientation = self._frozen_orientation()
+            ppo.compute_returns(self.env.orient(orientation))
+
+    # --- the update -------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, float]:
+        """One PPO update of each learner.
+
+        Returns:
+            For each learner ``name/value``, ``name/surrogate``, ``name/entropy`` (means over the
+            minibatches), ``name/kl`` (old to new policy, after the update), ``name/learning_rate``.
+        """
+        losses: dict[str, float] = {}
+        for name, ppo in self.learners.items():
+            self.anneal(name)
+            losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
+            losses[f"{name}/kl"] = self._divergence(ppo)
+            losses[f"{name}/learning_rate"] = ppo.learning_rate
+        self.iteration += 1
+        return losses
+
+    def anneal(self, name: str) -> None:
+        """Set learning rate and entropy bonus as this iteration's share of the run says."""
+        ppo, schedule = self.learners[name], self.schedules[name]
+        done = min(1.0, self.iteration / max(1, self.iterations))
+        first, last = schedule["entropy_coef"], schedule["final_entropy_coef"]
+        ppo.entropy_coef = first + done * (last - first)
+        if schedule["schedule"] == "linear":
+            ppo.learning_rate = schedule["learning_rate"] * (1 - done)
+            for group in ppo.optimizer.param_groups:
+                group["lr"] = ppo.learning_rate
+
+    @staticmethod
+    def _divergence(ppo: PPO) -> float:
+        """Mean KL(old || new) over states of the last rollout, spread evenly through it."""
+        storage = ppo.storage
+        total = storage.num_envs * storage.num_transitions_per_env
+        chosen = torch.arange(0, total, max(1, total // KL_SAMPLES), device=storage.device)
+        with torch.inference_mode():
+            ppo.actor(storage.observations.flatten(0, 1)[chosen], stochastic_output=True)
+            old = tuple(p.flatten(0, 1)[chosen] for p in storage.distribution_params)
+            new = ppo.actor.output_distribution_params
+            return float(ppo.actor.get_kl_divergence(old, new).mean())
+
+    # --- what else the runner asks ----------------------------------------------------------------
+
+    @property
+    def learning_rate(self) -> float:
+        """The first learner's; each one's own is among the losses."""
+        return float(next(iter(self.learners.values())).learning_rate)
+
+    @property
+    def output_std(self) -> Tensor:
+        """Spread of the learners' last action distributions (their ``std``)."""
+        return torch.cat([ppo.actor.output_std for ppo in self.learners.values()])
+
+    def get_policy(self) -> PackingPPO:
+        """Itself: there is more than one actor."""
+        return self
+
+    def train_mode(self) -> None:
+        """All networks to training mode."""
+        for ppo in self.learners.values():
+            ppo.train_mode()
+
+    def eval_mode(self) -> None:
+        """All networks to evaluation mode."""
+        for ppo in self.learners.values():
+            ppo.eval_mode()
+
+    def broadcast_parameters(self) -> None:
+        """Give all processes the first one's weights."""
+        for ppo in self.learners.values():
+            ppo.broadcast_parameters()
+
+    def save(self) -> dict[str, Any]:
+        """Stock states of the learners' PPOs, by name, and the place in the schedules."""
+        return {
+            "learners": {name: ppo.save() for name, ppo in self.learners.items()},
+            "schedule_iteration": self.iteration,
+        }
+
+    def load(
+        self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool
+    ) -> bool:
+        """Load what :meth:`save` gave; returns whether the iteration is to be loaded too."""
+        wanted = True
+        for name, ppo in self.learners.items():
+            wanted = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
+        self.iteration = loaded_dict["schedule_iteration"]
+        return wanted
+
+    @staticmethod
+    def construct_algorithm(
+        obs: TensorDict, env: PackingVecEnv, cfg: dict[str, Any], device: str
+    ) -> PackingPPO:
+        """Build it from the runner's configuration.
+
+        Args:
+            obs: an observation.
+            env: the bins.
+            cfg: ``algorithm`` with ``iterations``; ``agents``: for each agent either ``frozen``
+                (its name or checkpoint) or ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule``
+                and ``symmetry``.
+            device: of the networks.
+        """
+        learners, schedules = {}, {}
+        sources: dict[str, str] = {}
+        for name, settings in cfg["agents"].items():
+            if settings.get("frozen"):
+                sources[name] = settings["frozen"]
+                continue
+            seen = obs
+            if name == "placement":
+                seen = env.orient(torch.zeros(env.num_envs, dtype=torch.int64, device=env.device))
+            learners[name] = _stock_ppo(name, settings, seen, env, cfg, device)
+            schedules[name] = settings["schedule"]
+        orientation_agent = placement_agent = None
+        if "orientation" in sources:
+            orientation_agent = find_orientation_agent(sources["orientation"], device, None)
+        if "placement" in sources:
+            placement_agent = find_placement_agent(sources["placement"], device, None)
+        iterations = cfg["algorithm"]["iterations"]
+        return PackingPPO(learners, orientation_agent, placement_agent, env, schedules, iterations)
+
+
+def _stock_ppo(
+    name: str,
+    settings: Mapping[str, Any],
+    obs: TensorDict,
+    env: PackingVecEnv,
+    cfg: dict[str, Any],
+    device: str,
+) -> PPO:
+    """rsl_rl's own PPO with our actor and critic."""
+    network = dict(settings["network"])
+    model = {"agent": name, "network": network}
+    agent_cfg = {
+        "algorithm": {
+            "class_name": PPO,
+            "share_cnn_encoders": network["share_trunk"],
+            **settings["algorithm"],
+        },
+        "actor": {"class_name": Actor, **model},
+        "critic": {"class_name": Critic, **model},
+        "obs_groups": {"actor": list(obs.keys()), "critic": list(obs.keys())},
+        "num_steps_per_env": cfg["num_steps_per_env"],
+        "multi_gpu": cfg["multi_gpu"],
+    }
+    alone = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
+        ppo = PPO.construct_algorithm(obs, alone, agent_cfg, device)
+    if settings["symmetry"]:
+        ppo.storage = SymmetricStorage(
+            name, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [1], device
+        )
+    return ppo

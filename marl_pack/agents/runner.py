@@ -1,0 +1,296 @@
+"""rsl_rl's ``OnPolicyRunner`` with checkpoints that resume exactly, and evaluation as it goes.
+
+The training loop, the optimisation and the scalars are rsl_rl's own; what is added happens once an
+iteration, after rsl_rl has logged it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.logger import Logger
+from torch import Tensor
+
+import marl_pack
+from marl_pack.agents import checkpoint
+from marl_pack.agents.ppo import PackingPPO
+from marl_pack.vec_env import PackingVecEnv
+
+LOGGER_STATE = ("tot_timesteps", "tot_time", "cur_reward_sum", "cur_episode_length")
+LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
+
+
+class RunInterruptedError(Exception):
+    """The run was asked to stop, and has, at the end of an iteration, with a checkpoint."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What one iteration brought, for whoever shows it."""
+
+    iteration: int  # those done, this one included
+    items: int  # items placed since the run began, by all processes
+    items_per_second: float  # in this iteration
+    seconds: float  # spent learning since the run began
+    utilization: float  # mean of the episodes that ended in this iteration; NaN if none did
+    reward: float  # mean return of the last 100 episodes; NaN before the first
+    losses: dict[str, float]  # of :meth:`marl_pack.agents.ppo.PackingPPO.update`
+
+
+class IterationLogger(Logger):
+    """rsl_rl's logger, silent on the terminal, that reports each iteration to a function."""
+
+    report: Callable[[Progress], None]
+
+    def init_logging_writer(self) -> None:
+        """Open the writer, and keep the state of the code beside its logs."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().init_logging_writer()
+
+    def log(
+        self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float,
+        loss_dict: dict[str, float], **others: Any,
+    ) -> None:  # fmt: skip
+        """Log as rsl_rl does, then report."""
+        ended = [extra["Train/utilization"] for extra in self.ep_extras if extra]
+        utilization = float(torch.cat(ended).mean()) if ended else float("nan")
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().log(it, start_it, total_it, collect_time, learn_time, loss_dict, **others)
+        batch = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
+        if self.writer is None:  # rsl_rl counts where it logs; the other processes must agree
+            self.tot_timesteps += batch
+            self.tot_time += collect_time + learn_time
+        rewards = self.rewbuffer
+        self.report(
+            Progress(
+                it + 1, self.tot_timesteps, batch / (collect_time + learn_time), self.tot_time,
+                utilization, sum(rewards) / len(rewards) if rewards else float("nan"), loss_dict,
+            )
+        )  # fmt: skip
+
+
+class Runner(OnPolicyRunner):
+    """Trains the agents of :class:`marl_pack.agents.ppo.PackingPPO`.
+
+    Args:
+        env: the bins.
+        train_cfg: as rsl_rl's runner takes it, with ``agents`` and ``algorithm`` as
+            :meth:`PackingPPO.construct_algorithm` says, and ``latest_every``, ``evaluate_every``:
+            iterations between checkpoints and between evaluations (0: none).
+        log_dir: the run's folder; None keeps no logs and no checkpoints.
+        device: of everything.
+        config: the run's settings, kept in the checkpoints.
+        evaluate: gives a dict with ``utilization`` of the policy in a checkpoint.
+        show: is told of each iteration.
+        evaluated: is told of each evaluation, with the history up to it.
+    """
+
+    alg: PackingPPO
+    logger: IterationLogger
+
+    def __init__(
+        self,
+        env: PackingVecEnv,
+        train_cfg: dict[str, Any],
+        log_dir: Path | None,
+        device: str,
+        *,
+        config: Mapping[str, Any],
+        evaluate: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None,
+        show: Callable[[Progress], None] = lambda progress: None,
+        evaluated: Callable[[list[dict[str, Any]]], None] = lambda history: None,
+    ) -> None:
+        super().__init__(env, train_cfg, None if log_dir is None else str(log_dir), device)
+        self.folder = log_dir
+        stock = vars(self.logger)
+        self.logger = IterationLogger.__new__(IterationLogger)  # with what rsl_rl has set up
+        self.logger.__dict__.update(stock)
+        self.logger.git_status_repos = [marl_pack.__file__]
+        self.logger.report = self._after_iteration
+        self.config, self.evaluate, self.show = dict(config), evaluate, show
+        self.evaluated = evaluated
+        self.evaluations: list[dict[str, Any]] = []
+        self.stop_requested = False
+        self.last_iteration = 0  # of this call of learn()
+        self._frozen = {
+            name: checkpoint.frozen_agent(settings["frozen"], name)
+            for name, settings in train_cfg["agents"].items()
+            if settings.get("frozen")
+        }
+
+    def train(self, iterations: int) -> None:
+        """Learn until the run has done ``iterations`` in all.
+
+        Raises:
+            RunInterruptedError: if :attr:`stop_requested` was set; a checkpoint has been written.
+        """
+        self.last_iteration = iterations - 1
+        remaining = iterations - self.current_learning_iteration
+        if remaining > 0:
+            self.learn(remaining)
+            self.current_learning_iteration += 1  # rsl_rl would repeat the last one
+
+    def _after_iteration(self, progress: Progress) -> None:
+        """Evaluate, checkpoint and stop where it is time to."""
+        self.current_learning_iteration = it = progress.iteration - 1
+        self.show(progress)
+        final = it == self.last_iteration
+        stop = self._any_process(self.stop_requested)
+        if self.folder is None:
+            if stop:
+                raise RunInterruptedError
+            return
+        every = self.cfg["evaluate_every"]
+        if self.evaluate is not None and every and (final or progress.iteration % every == 0):
+            self._evaluate(progress)
+        if stop or final or progress.iteration % self.cfg["latest_every"] == 0:
+            state = self._gather(self.state())  # every process takes part
+            if self.gpu_global_rank == 0:
+                checkpoint.write(
+                    self.folder / checkpoint.LATEST, self.checkpoint() | {"state": state}
+                )
+        if stop and not final:
+            raise RunInterruptedError
+
+    def _evaluate(self, progress: Progress) -> None:
+        """Add a row to the history; keep the checkpoint if it is the best so far."""
+        if self.gpu_global_rank != 0:
+            return
+        start = time.perf_counter()
+        found = self.evaluate(self.checkpoint())  # type: ignore[misc]  # the caller has looked
+        row = {
+            "iteration": progress.iteration,
+            "items": progress.items,
+            "seconds": progress.seconds,
+            **found,
+            "evaluation_seconds": time.perf_counter() - start,
+        }
+        best = max((r["utilization"] for r in self.evaluations), default=float("-inf"))
+        self.evaluations.append(row)
+        if self.logger.writer is not None:
+            self.logger.writer.add_scalar(
+                "Evaluation/utilization", row["utilization"], progress.iteration - 1
+            )
+        self.evaluated(self.evaluations)
+        if row["utilization"] > best:
+            checkpoint.write(self.folder / checkpoint.BEST, self.checkpoint())  # type: ignore[operator]  # likewise
+
+    # --- checkpoints ------------------------------------------------------------------------------
+
+    def checkpoint(self) -> dict[str, Any]:
+        """The run's settings, networks and progress, as :mod:`marl_pack.agents.checkpoint` says."""
+        algorithm = self.alg.save()
+        learned = {
+            name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
+            for name, state in algorithm.pop("learners").items()
+        }
+        return {
+            "format": checkpoint.FORMAT,
+            "marl_pack": marl_pack.__version__,
+            "config": self.config,
+            "agents": learned | self._frozen,
+            "iter": self.current_learning_iteration,
+            "items": self.logger.tot_timesteps,
+            "seconds": self.logger.tot_time,
+            "evaluations": self.evaluations,
+            **algorithm,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """What else this process needs to go on as if it had never stopped."""
+        random: dict[str, Tensor] = {"cpu": torch.get_rng_state()}
+        if torch.device(self.device).type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
+        logger = {name: getattr(self.logger, name) for name in LOGGER_STATE}
+        logger |= {name: list(getattr(self.logger, name)) for name in LOGGER_BUFFERS}
+        return {"game": self.env.game.state_dict(), "random": random, "logger": logger}
+
+    def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint; rsl_rl calls this every ``save_interval`` iterations."""
+        checkpoint.write(Path(path), self.checkpoint() | {"infos": infos})
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def load(
+        self,
+        path: str,
+        load_cfg: dict[str, Any] | None = None,
+        strict: bool = True,
+        map_location: str | None = None,
+    ) -> dict[str, Any] | None:
+        """Load networks and optimisers from a checkpoint, to learn on from its next iteration."""
+        found = checkpoint.read(path, map_location or self.device)
+        if self.alg.load(found | {"learners": found["agents"]}, load_cfg, strict):
+            self.current_learning_iteration = found["iter"] + 1
+        infos: dict[str, Any] | None = found.get("infos")
+        return infos
+
+    def resume(self, found: Mapping[str, Any]) -> None:
+        """Go on exactly from the checkpoint of a run with the same settings.
+
+        Args:
+            found: what :func:`marl_pack.agents.checkpoint.read` gave of the run's latest.
+
+        Raises:
+            ValueError: if the checkpoint cannot be resumed by this run.
+        """
+        states = found.get("state")
+        if states is None:
+            raise ValueError("this checkpoint holds no state of the game; resume from latest.pt")
+        if len(states) != self.gpu_world_size:
+            raise ValueError(
+                f"the run had {len(states)} processes, this one has {self.gpu_world_size}"
+            )
+        self.alg.load(dict(found) | {"learners": found["agents"]}, None, True)
+        self.current_learning_iteration = found["iter"] + 1
+        self.evaluations = list(found["evaluations"])
+        own = states[self.gpu_global_rank]
+        self.env.game.load_state_dict(own["game"])
+        for name in LOGGER_STATE:
+            value = own["logger"][name]
+            setattr(self.logger, name, value.to(self.device) if torch.is_tensor(value) else value)
+        for name in LOGGER_BUFFERS:
+            getattr(self.logger, name).extend(own["logger"][name])
+        torch.set_rng_state(own["random"]["cpu"].cpu())
+        if "cuda" in own["random"]:
+            torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
+
+    # --- several processes ------------------------------------------------------------------------
+
+    def _configure_multi_gpu(self) -> None:
+        """As rsl_rl does for GPUs; processes on the CPU speak through gloo."""
+        world = int(os.environ.get("WORLD_SIZE", "1"))
+        if world == 1 or torch.device(self.device).type != "cpu":
+            super()._configure_multi_gpu()
+            return
+        rank = int(os.environ["RANK"])
+        self.gpu_world_size, self.is_distributed = world, True
+        self.gpu_global_rank, self.gpu_local_rank = rank, int(os.environ["LOCAL_RANK"])
+        self.cfg["multi_gpu"] = {
+            "global_rank": rank, "local_rank": self.gpu_local_rank, "world_size": world
+        }  # fmt: skip
+        torch.distributed.init_process_group("gloo", rank=rank, world_size=world)
+
+    def _any_process(self, flag: bool) -> bool:
+        """Whether any process says so."""
+        if not self.is_distributed:
+            return flag
+        votes = torch.tensor(float(flag), device=self.device)
+        torch.distributed.all_reduce(votes, op=torch.distributed.ReduceOp.MAX)
+        return bool(votes)
+
+    def _gather(self, state: dict[str, Any]) -> list[dict[str, Any]] | None:
+        """The states of all processes, in the first one."""
+        if not self.is_distributed:
+            return [state]
+        states: list[Any] = [None] * self.gpu_world_size
+        torch.distributed.gather_object(state, states if self.gpu_global_rank == 0 else None)
+        return states

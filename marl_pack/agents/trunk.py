@@ -1,0 +1,171 @@
+"""What both agents' networks are made of: planes of cells in, features of cells out.
+
+Everything is convolutional or pooled over the cells, so one network runs on any bin size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+PLANES = ("mask", "rest", "waste")
+"""Extra planes a network may see, for each orientation its agent has to judge: the cells where the
+item may be set down, its resting height at every cell, and the space it would enclose there."""
+
+
+@dataclass
+class Network:
+    """Shape of an agent's network.
+
+    Args:
+        channels: feature planes of the convolutional trunk.
+        layers: number of its 3 × 3 convolutions.
+        residual: whether each convolution after the first adds to its input.
+        context: whether features pooled over the whole bin are added to every cell's.
+        planes: what is seen beside the paper's four channels: any of mask, rest, waste.
+        hidden: units of the hidden layer in the heads that follow pooling.
+        share_trunk: whether the critic looks at the actor's features or has a trunk of its own.
+    """
+
+    channels: int = 32
+    layers: int = 3
+    residual: bool = True
+    context: bool = False
+    planes: list[str] = field(default_factory=lambda: list(PLANES))
+    hidden: int = 64
+    share_trunk: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("channels", "layers", "hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"network: {name} = {getattr(self, name)}, needs 1 or more")
+        unknown = [plane for plane in self.planes if plane not in PLANES]
+        if unknown or len(set(self.planes)) < len(self.planes):
+            raise ValueError(f"network: planes {self.planes}: any of {', '.join(PLANES)}, once")
+
+
+def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor:
+    """The paper's four channels and the extra planes, float32 [B, 4 + A · len(planes), W, D].
+
+    Args:
+        observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
+            and for the extra planes ``cells`` bool, ``rest`` int or ``waste`` int [B, A, W, D].
+        planes: which of :data:`PLANES`.
+
+    Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
+    share of the item's own volume, so that the planes mean the same in every bin.
+    """
+    heightmap, item = observation["heightmap"], observation["item"].float()
+    width, depth = heightmap.shape[1:]
+    height = observation["height"].float()  # [B, 1]
+    scale = torch.cat((torch.full_like(height, width), torch.full_like(height, depth), height), 1)
+    seen = [heightmap.float()[:, None] / height[:, :, None, None]]
+    seen.append((item / scale)[:, :, None, None].expand(-1, -1, width, depth))
+    for plane in planes:
+        if plane == "mask":
+            seen.append(observation["cells"].float())
+        elif plane == "rest":
+            seen.append(observation["rest"].float() / height[:, :, None, None])
+        else:
+            seen.append(observation["waste"].float() / (item.prod(1) + 1)[:, None, None, None])
+    return torch.cat(seen, 1).contiguous(memory_format=torch.channels_last)
+
+
+def pool(features: Tensor) -> Tensor:
+    """Mean and maximum over the cells, [B, 2C] of [B, C, W, D]."""
+    # adaptive_max_pool2d is amax with a backward pass that costs a quarter.
+    most = nn.functional.adaptive_max_pool2d(features, 1).flatten(1)
+    return torch.cat((features.mean((2, 3)), most), 1)
+
+
+class Trunk(nn.Module):
+    """Observation → features [B, C, W, D].
+
+    Args:
+        ways: orientations A for which the extra planes come.
+        network: its shape.
+    """
+
+    def __init__(self, ways: int, network: Network) -> None:
+        super().__init__()
+        self.planes, self.residual = list(network.planes), network.residual
+        channels = network.channels
+        wide = [4 + ways * len(self.planes)] + [channels] * network.layers
+        self.convolutions = nn.ModuleList(
+            initialized(nn.Conv2d(a, b, 3, padding=1)) for a, b in pairwise(wide)
+        )
+        self.context = initialized(nn.Linear(2 * channels, channels)) if network.context else None
+        # (observation, its features), kept from the actor for the critic that shares this trunk.
+        self._kept: tuple[object, Tensor] | None = None
+
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Features of every cell."""
+        x = input_planes(observation, self.planes)
+        for k, convolution in enumerate(self.convolutions):
+            y = torch.relu(convolution(x))
+            x = x + y if self.residual and k else y
+            if k == 0 and self.context is not None:
+                x = x + self.context(pool(x))[:, :, None, None]
+        return x
+
+    def keep(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """The features, kept for one :meth:`take` with the same observation."""
+        features: Tensor = self(observation)
+        self._kept = (observation, features)
+        return features
+
+    def take(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """The features :meth:`keep` has just made of the very same observation, else fresh ones."""
+        kept, self._kept = self._kept, None
+        if kept is not None and kept[0] is observation:
+            return kept[1]
+        features: Tensor = self(observation)
+        return features
+
+
+def initialized(layer: nn.Conv2d | nn.Linear, gain: float = math.sqrt(2)) -> nn.Module:
+    """The layer with orthogonal weights and no bias to begin with."""
+    nn.init.orthogonal_(layer.weight, gain)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+    return layer
+
+
+def pooled_head(network: Network, outputs: int, gain: float) -> nn.Sequential:
+    """Pooled features → ``outputs`` numbers, by one hidden layer."""
+    return nn.Sequential(
+        Pool(),
+        initialized(nn.Linear(2 * network.channels, network.hidden)),
+        nn.ReLU(),
+        initialized(nn.Linear(network.hidden, outputs), gain),
+    )
+
+
+class Pool(nn.Module):
+    """:func:`pool` as a layer."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Mean and maximum over the cells, [B, 2C]."""
+        return pool(features)
+
+
+class ScoreMap(nn.Module):
+    """Features → a score for each cell in A orientations, [B, A · W · D].
+
+    Args:
+        ways: A.
+        network: its shape.
+    """
+
+    def __init__(self, ways: int, network: Network) -> None:
+        super().__init__()
+        self.scores = initialized(nn.Conv2d(network.channels, ways, 1), 0.01)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Scores in the order of the actions: orientation, x, y."""
+        return self.scores(features).flatten(1)

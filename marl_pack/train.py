@@ -1,0 +1,431 @@
+"""Train the orientation and the placement agent.
+
+``python -m marl_pack.train --config configs/rs.yaml --seed 1`` makes a run's folder with the
+resolved settings, checkpoints, TensorBoard's logs and the history of evaluations;
+``--resume runs/NAME`` goes on with it. ``--help`` lists every setting.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+import math
+import os
+import platform
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+import marl_pack
+from marl_pack import evaluate
+from marl_pack.agents import checkpoint
+from marl_pack.agents.runner import Progress, RunInterruptedError, Runner
+from marl_pack.config import Agent, Config, ConfigError, from_dict, parse
+from marl_pack.files import write_atomically
+from marl_pack.items import Stream, choose_stream
+from marl_pack.packing import Packing
+from marl_pack.vec_env import PackingVecEnv
+
+PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
+QUIET_SECONDS = 30.0  # between lines of progress where the output is not a terminal
+MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
+
+
+def rank() -> int:
+    """This process's number among those that torchrun started; 0 alone."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def local_device(config: Config) -> str:
+    """The device of this process."""
+    if config.device == "cuda" and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        return f"cuda:{os.environ['LOCAL_RANK']}"
+    return config.device
+
+
+def derived_seed(*parts: int) -> int:
+    """A seed of its own for each process; none that a user would give to an evaluation."""
+    low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
+    return int(high >> 1) << 32 | int(low)
+
+
+def make_stream(config: Config) -> Stream:
+    """The items of the game.
+
+    Raises:
+        ConfigError: if they do not go with the bin.
+    """
+    game = config.game
+    try:
+        return choose_stream(game.items, game.bin, game.sides)[0]
+    except ValueError as error:
+        raise ConfigError(f"game.items: {error}") from None
+
+
+def make_game(
+    config: Config, n: int, seed: int, *, auto_reset: bool, device: str, first_episode: int = 0
+) -> Packing:
+    """N bins as the settings say."""
+    game = config.game
+    return Packing(
+        n, game.bin, make_stream(config), rule=game.rule, rule_parameters=game.rule_parameters(),
+        orientations=game.orientations, mask_orientations=game.mask_orientations,
+        alpha=game.alpha, beta=game.beta, com_offset=game.com_offset, auto_reset=auto_reset,
+        device=device, seed=seed, first_episode=first_episode,
+    )  # fmt: skip
+
+
+def runner_settings(config: Config) -> dict[str, Any]:
+    """What :class:`marl_pack.agents.runner.Runner` takes, from the settings."""
+    ppo = asdict(config.ppo)
+    steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
+    symmetry, final_entropy = ppo.pop("symmetry"), ppo.pop("final_entropy_coef")
+    ppo.pop("num_envs")
+    schedule = ppo.pop("schedule")
+    ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
+
+    def agent(own: Agent) -> dict[str, Any]:
+        if own.frozen:
+            return {"frozen": own.policy}
+        rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
+        entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
+        last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef
+        return {
+            "network": asdict(own.network),
+            "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
+            "symmetry": symmetry,
+            "schedule": {
+                "schedule": schedule, "learning_rate": rate, "entropy_coef": entropy,
+                "final_entropy_coef": entropy if last is None else last,
+            },
+        }  # fmt: skip
+
+    agents = {"orientation": config.orientation, "placement": config.placement}
+    if config.joint:
+        agents = {"joint": config.placement}
+    logger: str | dict[str, Any] = "tensorboard"
+    if config.output.logger == "wandb":
+        logger = {"class_name": "WandbLogWriter", "project_name": config.output.wandb_project}
+    return {
+        "num_steps_per_env": steps,
+        "save_interval": config.output.keep_every,
+        "check_for_nan": True,
+        "logger": logger,
+        "algorithm": {
+            "class_name": "marl_pack.agents.ppo:PackingPPO", "iterations": iterations,
+        },
+        "agents": {name: agent(own) for name, own in agents.items()},
+        "latest_every": config.output.latest_every,
+        "evaluate_every": config.evaluation.every,
+    }  # fmt: skip
+
+
+def make_runner(config: Config, folder: Path | None, **reports: Callable[..., Any]) -> Runner:
+    """The environment, the agents and the runner of a run.
+
+    Raises:
+        ConfigError: if a setting cannot be.
+    """
+    device = local_device(config)
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"device = {config.device}: {error}") from None
+    torch.manual_seed(config.seed)
+    settings = runner_settings(config)
+    planes = {
+        name: agent["network"]["planes"]
+        for name, agent in settings["agents"].items()
+        if "network" in agent
+    }
+    try:
+        game = make_game(
+            config, config.ppo.num_envs, derived_seed(config.seed, rank()), auto_reset=True,
+            device=device,
+        )  # fmt: skip
+        env = PackingVecEnv(game, planes, config.as_dict())
+        runner = Runner(env, settings, folder, device, config=config.as_dict(), **reports)
+    except (ValueError, FileNotFoundError) as error:
+        raise ConfigError(str(error)) from None
+    torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
+    return runner
+
+
+def evaluation(config: Config, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Play the held-out sequences with a checkpoint's agents, each taking its best action."""
+    device = local_device(config)
+    policy = checkpoint.load_policy(found, device, config.evaluation.seed)
+
+    def game(n: int, first_episode: int) -> Packing:
+        return make_game(
+            config, n, config.evaluation.seed, auto_reset=False, device=device,
+            first_episode=first_episode,
+        )  # fmt: skip
+
+    stream = make_stream(config)
+    episodes = min(config.evaluation.episodes, stream.episodes or config.evaluation.episodes)
+    return evaluate.mean_utilization(evaluate.play(policy, game, episodes))
+
+
+class Display:
+    """Progress on the terminal: a bar where there is one, else a line now and then."""
+
+    def __init__(self, console: Console, total: int, done: int) -> None:
+        self.console, self.total = console, total
+        self.live = console.is_terminal
+        self.bar = Bar(
+            TextColumn("iteration {task.completed:.0f}/{task.total:.0f}"), BarColumn(20),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+            TextColumn("{task.description}"), console=console,
+        )  # fmt: skip
+        self.task = self.bar.add_task("", total=total, completed=done)
+        self.said, self.rate = 0.0, 0.0
+
+    def show(self, progress: Progress) -> None:
+        """One iteration is done."""
+        text = self.line(progress)
+        self.rate = progress.items_per_second
+        self.bar.update(self.task, completed=progress.iteration, description=text)
+        now = time.monotonic()
+        final = progress.iteration == self.total
+        if not self.live and (final or now - self.said > QUIET_SECONDS):
+            self.said = now
+            left = (self.total - progress.iteration) * progress.seconds / progress.iteration
+            self.console.print(
+                f"iteration {progress.iteration}/{self.total}  {text}  "
+                f"left {datetime.timedelta(seconds=round(left))}",
+                soft_wrap=True,
+            )
+
+    @staticmethod
+    def line(progress: Progress) -> str:
+        """Speed, utilization, reward, and each learner's entropy and KL."""
+        shown = [f"{progress.items_per_second:,.0f} items/s"]
+        if not math.isnan(progress.utilization):
+            shown.append(f"util {100 * progress.utilization:.1f} %")
+        if not math.isnan(progress.reward):
+            shown.append(f"reward {progress.reward:.3f}")
+        for key, value in progress.losses.items():
+            name, _, what = key.partition("/")
+            if what in ("entropy", "kl"):
+                shown.append(f"{name[:5]} {what} {value:.3f}")
+        return "  ".join(shown)
+
+    def evaluated(self, row: Mapping[str, Any]) -> None:
+        """An evaluation is done."""
+        half = (row["high"] - row["low"]) / 2
+        self.console.print(
+            f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "
+            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f} "
+            f"± {100 * half:.2f} % over {row['episodes']} episodes",
+            soft_wrap=True,
+        )
+
+
+def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
+    """Write the evaluations as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(history[0]))
+    writer.writeheader()
+    writer.writerows(history)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+
+def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
+    """Keep the settings, and what ran them, beside the checkpoints."""
+    text = yaml.safe_dump(config.as_dict(), sort_keys=False)
+    write_atomically(folder / "config.yaml", lambda file: file.write(text.encode()))
+    versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
+    versions |= {name: metadata.version(name) for name in PACKAGES}
+    record = {
+        "arguments": list(arguments),
+        "seed": config.seed,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "processes": int(os.environ.get("WORLD_SIZE", "1")),
+        "versions": versions,
+    }
+    record_text = json.dumps(record, indent=2) + "\n"
+    write_atomically(folder / "run.json", lambda file: file.write(record_text.encode()))
+
+
+def new_folder(config: Config) -> Path:
+    """The folder of a new run; all processes of a run name the same one.
+
+    Raises:
+        ConfigError: if there is a run in it.
+    """
+    name = config.output.name
+    if name is None:
+        stamp = os.environ.get("TORCHELASTIC_RUN_ID", "")
+        name = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        name = f"{name}_seed{config.seed}" if stamp in ("", "none") else stamp
+    folder = Path(config.output.folder) / name
+    if (folder / checkpoint.LATEST).exists():
+        raise ConfigError(
+            f"output.name: {folder} holds a run; --resume {folder} goes on with it; or name another"
+        )
+    return folder
+
+
+def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]:
+    """The settings and the latest checkpoint of a run to go on with.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: if it cannot be resumed so.
+    """
+    folder = Path(run)
+    found = checkpoint.read(folder / checkpoint.LATEST if folder.is_dir() else folder)
+    kept = from_dict(found["config"])
+    config, options = parse(["--config", yaml.safe_dump(kept.as_dict()), *arguments])
+    if len(options.config or []) > 1:
+        raise ConfigError("--resume: the run has its own settings; give no --config beside it")
+    before, after = _flat(kept.as_dict()), _flat(config.as_dict())
+    for key, value in after.items():
+        if value != before[key] and not key.startswith(MAY_CHANGE):
+            raise ConfigError(
+                f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
+                "output.*, evaluation.* and ppo.max_iterations may change"
+            )
+    return config, found
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys of nested settings."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def train(
+    config: Config,
+    folder: Path,
+    console: Console,
+    found: Mapping[str, Any] | None = None,
+) -> Runner:
+    """Run the training to its end.
+
+    Args:
+        config: the settings.
+        folder: the run's, made if need be.
+        console: where progress goes.
+        found: the checkpoint to go on from.
+
+    Raises:
+        RunInterruptedError: after SIGINT or SIGTERM, with a checkpoint written.
+        ConfigError, ValueError: if a setting or the checkpoint cannot be.
+    """
+    torch.set_num_threads(config.threads)
+    total = config.ppo.max_iterations
+    display = Display(console, total, 0 if found is None else found["iter"] + 1)
+
+    def evaluated(history: list[dict[str, Any]]) -> None:
+        write_history(folder / "evaluations.csv", history)
+        display.evaluated(history[-1])
+
+    folder.mkdir(parents=True, exist_ok=True)
+    runner = make_runner(
+        config,
+        folder,
+        evaluate=lambda made: evaluation(config, made),
+        show=display.show if rank() == 0 else lambda progress: None,
+        evaluated=evaluated,
+    )
+    if found is not None:
+        runner.resume(found)
+    if rank() == 0:
+        write_record(folder, config, sys.argv[1:])
+
+    def stop(number: int, frame: object) -> None:
+        if runner.stop_requested:  # asked twice: at once
+            raise KeyboardInterrupt
+        runner.stop_requested = True
+        if rank() == 0:
+            console.print("stopping after this iteration; once more stops at once")
+
+    before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        if display.live and rank() == 0:
+            with display.bar:
+                runner.train(total)
+        else:
+            runner.train(total)
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+        if runner.is_distributed:
+            torch.distributed.destroy_process_group()
+    return runner
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command ``python -m marl_pack.train``."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    console = Console()
+    try:
+        config, options = parse(given) if "--resume" not in " ".join(given) else (None, None)
+        found = None
+        if config is None:
+            run, rest = _resume_option(given)
+            config, found = resumed(run, rest)
+            folder = Path(run) if Path(run).is_dir() else Path(run).parent
+        else:
+            folder = new_folder(config)
+        del options
+        runner = train(config, folder, console if rank() == 0 else Console(quiet=True), found)
+    except RunInterruptedError:
+        console.print(f"stopped with a checkpoint; go on with --resume {folder}")
+        return 130
+    except KeyboardInterrupt:
+        console.print("stopped at once; the last checkpoint is as it was")
+        return 130
+    except (ConfigError, ValueError, FileNotFoundError) as error:
+        print(f"python -m marl_pack.train: {error}", file=sys.stderr)
+        return 2
+    if rank() == 0:
+        console.print(
+            f"done: {runner.logger.tot_timesteps:,} items; play it with "
+            f"python -m marl_pack.evaluate --policy {folder}"
+        )
+    return 0
+
+
+def _resume_option(given: Sequence[str]) -> tuple[str, list[str]]:
+    """The folder after --resume, and the other options.
+
+    Raises:
+        ConfigError: if none is given.
+    """
+    rest, run = [], None
+    words = iter(given)
+    for word in words:
+        if word == "--resume":
+            run = next(words, None)
+        elif word.startswith("--resume="):
+            run = word.partition("=")[2]
+        else:
+            rest.append(word)
+    if not run:
+        raise ConfigError("--resume needs a run's folder")
+    return run, rest
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,131 @@
+"""The settings: every key explained, every file loads and runs, mistakes named."""
+
+import re
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+import yaml
+
+from marl_pack.config import Agent, Config, ConfigError, Game, from_dict, keys, make_parser, parse
+from marl_pack.stability import RULES
+from marl_pack.train import main
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+FILES = sorted(CONFIGS.rglob("*.yaml"))
+
+
+def test_there_are_configs_for_every_ablation() -> None:
+    names = {path.stem for path in FILES if path.parent.name == "ablations"}
+    assert names == {
+        "both", "joint", "orientation_random", "orientation_first", "placement_random",
+        "placement_dblf", "hull_1", "no_orientation_mask", "no_waste_penalty",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_config_runs_two_iterations(path: Path, tmp_path: Path) -> None:
+    small = ("--ppo.num_envs=8", "--ppo.num_steps_per_env=4", "--ppo.num_mini_batches=2",
+             "--ppo.max_iterations=2", "--evaluation.episodes=4", "--output.name=run")  # fmt: skip
+    assert main([f"--config={path}", *small, f"--output.folder={tmp_path}"]) == 0
+    assert (tmp_path / "run" / "latest.pt").is_file()
+    assert (tmp_path / "run" / "best.pt").is_file()
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_key_of_a_config_has_a_comment_above_it(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for above, line in zip(["", *lines], lines, strict=False):
+        if re.match(r"\s*[\w.]+:", line):
+            assert above.strip().startswith("#"), f"{path.name}: no comment above {line.strip()!r}"
+
+
+def test_the_main_config_holds_every_key_at_its_default() -> None:
+    written = yaml.safe_load((CONFIGS / "rs.yaml").read_text(encoding="utf-8"))
+    defaults = Config().as_dict()
+    for name in ("max_iterations",):  # how long it runs is the file's own
+        written["ppo"].pop(name)
+        defaults["ppo"].pop(name)
+    written["evaluation"].pop("every")
+    defaults["evaluation"].pop("every")
+    assert written == defaults
+
+
+def test_every_key_is_explained_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse(["--help"])
+    shown = re.sub(r"\s+", " ", capsys.readouterr().out)
+    for key in keys(make_parser()):
+        explained = re.search(rf"--{re.escape(key)} (.*?) \(type: ", shown)
+        assert explained is not None, key
+        assert len(explained[1].split()) >= 4, key
+
+
+def test_the_rules_are_those_there_are() -> None:
+    assert get_args(get_type_hints(Game)["rule"]) == tuple(RULES)
+
+
+def test_settings_go_to_plain_values_and_back() -> None:
+    config, _ = parse(["--game.bin=[6,7,8]", "--placement.network.planes=[rest]", "--seed=5",
+                       "--orientation.frozen=true", "--orientation.policy=first"])  # fmt: skip
+    again = from_dict(yaml.safe_load(yaml.safe_dump(config.as_dict())))
+    assert again == config
+    assert again.game.bin == (6, 7, 8)
+    assert again.orientation == Agent(frozen=True, policy="first")
+
+
+@pytest.mark.parametrize(("options", "told"), [
+    (["--ppo.gama=0.9"], r"unknown key ppo\.gama\. Did you mean ppo\.gamma\? Keys in ppo: clip"),
+    (["--sed=1"], r"unknown key sed\. Did you mean seed\? Keys: device, evaluation"),
+    (["--ppo.gamma=much"], r"ppo\.gamma.*float.*much"),
+    (["--game.rule=hull"], r"game\.rule.*one of 'hull_1', 'hull_alpha'.*hull"),
+    (["--game.bin=[10,10]"], r"game\.bin"),
+    (["--game.bin=[10,10,0]"], r"game\.bin.*0"),
+    (["--ppo.gamma=1.5"], r"ppo\.gamma = 1\.5: needs a number from 0 to 1"),
+    (["--ppo.learning_rate=.nan"], r"ppo\.learning_rate = nan: needs a positive"),
+    (["--placement.entropy_coef=-1"], r"placement = -1\.0"),
+    (["--ppo.num_envs=0"], r"ppo\.num_envs = 0: needs 1 or more"),
+    (["--ppo.num_envs=1", "--ppo.num_steps_per_env=2"], r"only 2 items"),
+    (["--threads=0"], r"threads = 0"),
+    (["--evaluation.every=-1"], r"evaluation\.every"),
+    (["--evaluation.episodes=1"], r"evaluation\.episodes"),
+    (["--output.latest_every=0"], r"output\.latest_every"),
+    (["--output.name=a/b"], r"output\.name"),
+    (["--placement.frozen=true"], r"placement\.policy = null: a frozen agent needs one"),
+    (["--placement.policy=dblf"], r"goes with placement\.frozen"),
+    (["--placement.frozen=true", "--placement.policy=dblf", "--orientation.frozen=true",
+      "--orientation.policy=random"], r"both agents are frozen"),
+    (["--joint=true", "--placement.frozen=true", "--placement.policy=dblf"], r"cannot be frozen"),
+    (["--placement.network.layers=0"], r"layers = 0"),
+    (["--ppo.symmetry=true", "--game.com_offset=[0.1,0,0]"], r"ppo\.symmetry.*off centre"),
+    (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
+])  # fmt: skip
+def test_a_mistake_is_named_with_what_would_be_right(options: list[str], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        parse(options)
+
+
+def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "typo.yaml"
+    path.write_text("placement:\n  network:\n    chanels: 3\n")
+    assert main([f"--config={path}"]) == 2
+    told = capsys.readouterr().err
+    assert "unknown key placement.network.chanels. Did you mean placement.network.channels?" in told
+    path.write_text("pppo:\n  gamma: 3\n")
+    assert main([f"--config={path}"]) == 2
+    assert "unknown key pppo.gamma" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("options", "told"), [
+    (["--device=abacus"], "device = abacus"),
+    (["--game.items=rs", "--game.bin=[4,4,4]"], "game.items: items 'rs' with sides 2..5"),
+    (["--game.items=nowhere.npz"], "nowhere.npz"),
+    (["--game.orientations=[7]"], "orientations"),
+    (["--game.rule=lbcp", "--game.thresholds=paper"], "thresholds"),
+    (["--orientation.frozen=true", "--orientation.policy=nobody"], "'nobody' is neither one of"),
+])  # fmt: skip
+def test_what_only_the_game_can_refuse_is_told_as_plainly(
+    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*options, f"--output.folder={tmp_path}"]) == 2
+    assert told in capsys.readouterr().err

@@ -1,0 +1,106 @@
+"""The agents' networks: what they see, any bin size, shared trunks."""
+
+import pytest
+import torch
+
+from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor
+from marl_pack.agents.trunk import PLANES, Network, input_planes
+from marl_pack.packing import Packing
+
+SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
+
+
+def observed(agent: str, game: Packing, planes: tuple[str, ...]) -> dict[str, torch.Tensor]:
+    if agent == "placement":
+        return placement.observe(game, planes, game.orientation_mask.int().argmax(1))
+    return (joint if agent == "joint" else orientation).observe(game, planes)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("planes", [(), PLANES])
+def test_one_network_runs_on_any_bin_size(agent: str, planes: tuple[str, ...]) -> None:
+    actor = make_actor(agent, {**SMALL, "planes": list(planes), "context": True}, "cpu")
+    for size in ((5, 5, 5), (9, 6, 7), (24, 30, 20)):
+        game = Packing(3, size, sides=(2, 4))
+        seen = observed(agent, game, planes)
+        actions = actor(seen, stochastic_output=True)
+        assert actions.shape == (3, 1)
+        assert seen["mask"].gather(1, actions.long()).all()
+        assert actor.distribution.log_probs.shape == seen["mask"].shape
+
+
+def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
+    game = Packing(1, (4, 6, 8), [[2, 3, 4]] * 2)
+    game.place(torch.tensor([0]), torch.tensor([0]))
+    seen = orientation.observe(game, ())
+    seen["item"] = torch.tensor([[2, 3, 4]])
+    planes = input_planes(seen, [])
+    assert planes.shape == (1, 4, 4, 6)
+    assert planes[0, 0, 0, 0] == 4 / 8
+    assert planes[0, 0, 3, 5] == 0
+    assert planes[0, 1:, 2, 2].tolist() == [2 / 4, 3 / 6, 4 / 8]
+    assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
+    game = Packing(2, (6, 6, 6), sides=(2, 4))
+    seen = orientation.observe(game, PLANES)
+    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 3 * 6, 6, 6)
+
+
+def test_an_observation_does_not_change_when_the_game_goes_on() -> None:
+    game = Packing(8, seed=1)
+    seen = orientation.observe(game, PLANES)
+    kept = {name: values.clone() for name, values in seen.items()}
+    for _ in range(30):
+        o = game.orientation_mask.int().argmax(1)
+        game.place(o, game.orient(o).mask.flatten(1).int().argmax(1))
+    assert all(torch.equal(seen[name], kept[name]) for name in kept)
+
+
+def pair(share: bool) -> tuple[Actor, Critic]:
+    torch.manual_seed(0)
+    arguments = {"agent": "placement", "network": {**SMALL, "share_trunk": share}}
+    groups = {"actor": [], "critic": []}
+    actor = Actor({}, groups, "actor", 1, **arguments)
+    cnns = {"cnns": actor.cnns} if share else {}
+    return actor, Critic({}, groups, "critic", 1, **arguments, **cnns)
+
+
+def test_a_critic_that_shares_the_trunk_sees_the_features_of_the_moment() -> None:
+    actor, critic = pair(share=True)
+    game = Packing(4, (6, 6, 6), sides=(2, 3))
+    first = observed("placement", game, ())
+    other = dict(first, item=first["item"] + 1)
+    actor(first)
+    kept = critic(first)
+    assert torch.equal(kept, critic(first)), "with and without the actor's features"
+    actor(first)
+    assert not torch.equal(critic(other), kept), "another observation is looked at anew"
+    actor(first)
+    critic(first)
+    with torch.no_grad():
+        for weight in actor.cnns.parameters():
+            weight.mul_(0.5)
+    assert not torch.equal(critic(first), kept), "changed weights are seen"
+
+
+def test_a_shared_trunk_is_the_actors_alone_in_parameters_and_state() -> None:
+    for share in (True, False):
+        actor, critic = pair(share)
+        own = {id(p) for p in actor.parameters()}
+        assert not own & {id(p) for p in critic.parameters()}
+        assert any(name.startswith("cnns.") for name in critic.state_dict()) != share
+
+
+def test_a_critic_teaches_the_shared_trunk() -> None:
+    actor, critic = pair(share=True)
+    seen = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
+    actor(seen, stochastic_output=True)
+    critic(seen).sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in actor.cnns.parameters())
+
+
+@pytest.mark.parametrize("wrong", [{"channels": 0}, {"layers": 0}, {"planes": ["depth"]},
+                                   {"planes": ["mask", "mask"]}])  # fmt: skip
+def test_an_impossible_network_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="network: "):
+        Network(**wrong)

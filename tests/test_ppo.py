@@ -1,0 +1,264 @@
+"""The trainer: two stock PPOs as one, against numbers worked by hand and against itself."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from torch import Tensor
+
+from marl_pack import evaluate
+from marl_pack.agents import checkpoint
+from marl_pack.agents.policy import Policy
+from marl_pack.agents.runner import RunInterruptedError, Runner
+from marl_pack.config import Config, parse
+from marl_pack.packing import Packing
+from marl_pack.train import make_game, make_runner
+
+TINY = (
+    "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=16", "--ppo.num_steps_per_env=4",
+    "--ppo.num_mini_batches=2", "--evaluation.every=0", "--output.latest_every=1",
+    "--orientation.network.channels=8", "--orientation.network.layers=2",
+    "--placement.network.channels=8", "--placement.network.layers=2",
+)  # fmt: skip
+
+
+def tiny(*options: str) -> Config:
+    return parse([*TINY, *options])[0]
+
+
+def weights(runner: Runner, name: str) -> dict[str, Tensor]:
+    ppo = runner.alg.learners[name]
+    both = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    return {f"{k}.{n}": v.clone() for k, s in both.items() for n, v in s.items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+# --- what PPO is told ---------------------------------------------------------------------------
+
+
+def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
+    runner = make_runner(tiny(), None)
+    env, alg = runner.env, runner.alg
+    obs = env.get_observations()
+    rewards, dones = [], []
+    with torch.inference_mode():
+        for _ in range(4):
+            game = env.game
+            mask, items = game.mask.clone(), game.items.clone()
+            actions = alg.act(obs)
+            obs, reward, done, extras = env.step(actions)
+            alg.process_env_step(obs, reward, done, extras)
+            rewards.append(reward)
+            dones.append(done)
+            step = len(rewards) - 1
+            o = actions[:, 0]
+            first, second = (alg.learners[n].storage for n in ("orientation", "placement"))
+            assert torch.equal(first.actions[step, :, 0].long(), o)
+            assert torch.equal(second.actions[step, :, 0].long(), actions[:, 1])
+            assert torch.equal(first.observations["item"][step], items)
+            legal = mask[torch.arange(16), o]
+            assert torch.equal(second.observations["mask"][step], legal.flatten(1))
+            assert legal.flatten(1).gather(1, actions[:, 1:]).all()
+    assert torch.stack(dones).any()
+    for ppo in alg.learners.values():
+        assert torch.equal(ppo.storage.rewards[..., 0], torch.stack(rewards))
+        assert torch.equal(ppo.storage.dones[..., 0], torch.stack(dones))
+
+
+def test_advantages_are_those_worked_by_hand() -> None:
+    runner = make_runner(tiny("--ppo.gamma=0.5", "--ppo.lam=0.5", "--ppo.num_envs=1",
+                              "--ppo.num_steps_per_env=3"), None)  # fmt: skip
+    for name, ppo in runner.alg.learners.items():
+        storage = ppo.storage
+        storage.rewards[:, 0, 0] = torch.tensor([1.0, 2.0, 3.0])
+        storage.values[:, 0, 0] = torch.tensor([4.0, 5.0, 6.0])
+        storage.dones[:, 0, 0] = torch.tensor([0, 1, 0]).byte()
+        ppo.critic.mlp = torch.nn.Module()
+        ppo.critic.forward = lambda obs: torch.tensor([[8.0]])  # V of the state after the rollout
+        obs = runner.env.get_observations()
+        if name == "placement":
+            obs = runner.env.orient(torch.zeros(1, dtype=torch.int64))
+        ppo.compute_returns(obs)
+        # δ₂ = 3 + ½·8 − 6 = 1; δ₁ = 2 − 5 = −3 (the episode ends); δ₀ = 1 + ½·5 − 4 = −½
+        # A₂ = 1; A₁ = −3; A₀ = −½ + ¼·(−3) = −1¼; returns A + V
+        assert storage.returns[:, 0, 0].tolist() == [2.75, 2.0, 7.0]
+        advantage = torch.tensor([-1.25, -3.0, 1.0])
+        normal = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        assert torch.allclose(storage.advantages[:, 0, 0], normal)
+
+
+def test_the_last_states_value_is_of_an_orientation_drawn_there_and_nothing_moves() -> None:
+    runner = make_runner(tiny(), None)
+    before = runner.env.game.state_dict()
+    with torch.inference_mode():
+        runner.alg.compute_returns(runner.env.get_observations())
+    assert same(before, runner.env.game.state_dict())
+
+
+def test_learning_rate_and_entropy_follow_their_schedules() -> None:
+    config = tiny("--ppo.learning_rate=1e-3", "--placement.learning_rate=4e-3",
+                  "--ppo.entropy_coef=0.01", "--ppo.final_entropy_coef=0.002",
+                  "--ppo.max_iterations=10")  # fmt: skip
+    alg = make_runner(config, None).alg
+    alg.iteration = 5
+    for name, rate in (("orientation", 5e-4), ("placement", 2e-3)):
+        alg.anneal(name)
+        ppo = alg.learners[name]
+        assert ppo.optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+        assert ppo.entropy_coef == pytest.approx(0.006)
+
+
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
+def test_the_other_schedules_run(schedule: str) -> None:
+    runner = make_runner(tiny(f"--ppo.schedule={schedule}", "--ppo.desired_kl=1e-9"), None)
+    runner.train(2)
+    rate = runner.alg.learners["placement"].optimizer.param_groups[0]["lr"]
+    assert (rate == 7e-4) == (schedule == "fixed")
+
+
+# --- learning -----------------------------------------------------------------------------------
+
+
+def played(config: Config, policy: Policy) -> float:
+    """Utilization of the config's one sequence."""
+
+    def game(n: int, first: int) -> Packing:
+        return make_game(config, n, 0, auto_reset=False, device="cpu", first_episode=first)
+
+    return float(evaluate.play(policy, game, 1).utilization.mean())
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_the_trainer_learns_to_pack_a_tiny_bin_as_well_as_can_be(
+    joint: bool, tmp_path: Path
+) -> None:
+    """Ten boxes of 3 × 2 × 1 are the most that 4 × 4 × 4 holds; random play sets down eight."""
+    path = tmp_path / "items.json"
+    path.write_text(json.dumps({"bin": [4, 4, 4], "items": [[3, 2, 1]] * 12}))
+    config = tiny(f"--game.items={path}", "--ppo.num_envs=64", "--ppo.num_steps_per_env=8",
+                  "--ppo.learning_rate=3e-3", "--ppo.num_mini_batches=4", "--ppo.max_iterations=60",
+                  "--placement.network.channels=16", f"--joint={str(joint).lower()}")  # fmt: skip
+    sampled: list[float] = []  # utilization of the training's own episodes
+    runner = make_runner(
+        config, tmp_path, show=lambda progress: sampled.append(progress.utilization)
+    )
+    runner.train(60)
+    assert sum(sampled[:3]) / 3 < 0.8
+    assert sum(sampled[-3:]) / 3 > 0.9
+    assert played(config, checkpoint.load_policy(runner.checkpoint())) == 60 / 64
+
+
+@pytest.mark.parametrize("options", [
+    ("--orientation.frozen=true", "--orientation.policy=random"),
+    ("--orientation.frozen=true", "--orientation.policy=first"),
+    ("--placement.frozen=true", "--placement.policy=random"),
+    ("--placement.frozen=true", "--placement.policy=dblf"),
+])  # fmt: skip
+def test_a_frozen_rule_plays_and_the_other_agent_learns(options: tuple[str, ...]) -> None:
+    runner = make_runner(tiny(*options), None)
+    (learner,) = runner.alg.learners
+    before = weights(runner, learner)
+    runner.train(2)
+    assert not same(before, weights(runner, learner))
+    frozen = {"orientation", "placement"} - {learner}
+    agents = runner.checkpoint()["agents"]
+    assert agents[frozen.pop()] == {"name": options[1].partition("=")[2]}
+
+
+@pytest.mark.parametrize("frozen", ["orientation", "placement"])
+def test_a_frozen_networks_weights_do_not_move_and_the_others_do(
+    frozen: str, tmp_path: Path
+) -> None:
+    first = make_runner(tiny(), None)
+    first.train(2)
+    path = tmp_path / "first.pt"
+    checkpoint.write(path, first.checkpoint())
+    second = make_runner(tiny(f"--{frozen}.frozen=true", f"--{frozen}.policy={path}"), None)
+    (learner,) = second.alg.learners
+    assert learner != frozen
+    before = weights(second, learner)
+    second.train(2)
+    assert not same(before, weights(second, learner))
+    kept = second.checkpoint()["agents"][frozen]
+    assert same(kept["actor_state_dict"], first.checkpoint()["agents"][frozen]["actor_state_dict"])
+    assert "optimizer_state_dict" not in kept
+
+
+def test_a_critic_with_a_trunk_of_its_own_and_symmetry_learn_too() -> None:
+    runner = make_runner(tiny("--ppo.symmetry=true", "--placement.network.share_trunk=false",
+                              "--orientation.network.planes=[mask,rest,waste]"), None)  # fmt: skip
+    before = weights(runner, "placement")
+    runner.train(2)
+    after = weights(runner, "placement")
+    assert all(not torch.equal(before[n], after[n]) for n in before if n.endswith("weight"))
+
+
+# --- stopping and going on ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [
+    (), ("--joint=true",), ("--orientation.frozen=true", "--orientation.policy=random"),
+    ("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--game.items=cut2"),
+])  # fmt: skip
+def test_a_resumed_run_gives_the_weights_of_one_never_stopped(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    config = tiny(*options, "--ppo.max_iterations=5")
+    whole = make_runner(config, tmp_path / "whole")
+    whole.train(5)
+    part = make_runner(config, tmp_path / "part")
+    part.show = lambda progress: setattr(part, "stop_requested", progress.iteration == 2)
+    with pytest.raises(RunInterruptedError):
+        part.train(5)
+    torch.manual_seed(12345)
+    resumed = make_runner(config, tmp_path / "part")
+    resumed.resume(checkpoint.read(tmp_path / "part" / "latest.pt"))
+    assert resumed.current_learning_iteration == 2
+    resumed.train(5)
+    for name in whole.alg.learners:
+        assert same(weights(whole, name), weights(resumed, name))
+    assert same(whole.env.game.state_dict(), resumed.env.game.state_dict())
+    a, b = (checkpoint.read(tmp_path / run / "latest.pt") for run in ("whole", "part"))
+    assert a["items"] == b["items"] == 5 * 16 * 4
+    assert a["state"][0]["logger"]["rewbuffer"] == b["state"][0]["logger"]["rewbuffer"]
+
+
+def test_another_games_state_is_refused(tmp_path: Path) -> None:
+    first = make_runner(tiny(), tmp_path)
+    first.train(1)
+    found = checkpoint.read(tmp_path / "latest.pt")
+    other = make_runner(tiny("--game.bin=[5,5,5]"), None)
+    with pytest.raises(ValueError, match="state of another game"):
+        other.resume(found)
+    found.pop("state")
+    with pytest.raises(ValueError, match=r"latest\.pt"):
+        other.resume(found)
+
+
+def test_a_stock_ppo_reads_an_agents_state(tmp_path: Path) -> None:
+    runner = make_runner(tiny(), None)
+    runner.train(1)
+    path = tmp_path / "placement.pt"
+    checkpoint.write(path, runner.checkpoint()["agents"]["placement"])
+    other = make_runner(tiny("--seed=7"), None)
+    stock = other.alg.learners["placement"]
+    assert type(stock) is PPO
+    assert not same(weights(other, "placement"), weights(runner, "placement"))
+    stock.load(torch.load(path, weights_only=True), None, True)
+    assert same(weights(other, "placement"), weights(runner, "placement"))
+    assert stock.learning_rate == runner.alg.learners["placement"].learning_rate
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
+    made = []
+    for seed in (1, 1, 2):
+        runner = make_runner(tiny(f"--seed={seed}"), None)
+        runner.train(2)
+        made.append(weights(runner, "orientation"))
+    assert same(made[0], made[1])
+    assert not same(made[0], made[2])

@@ -1,0 +1,87 @@
+"""Augmentation by the bin's symmetries: transformed play is play in the transformed bin."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.symmetry import transform
+from marl_pack.agents.trunk import PLANES
+from marl_pack.packing import Packing
+
+SIZE = (6, 6, 8)
+
+
+def played(size: tuple[int, int, int]) -> Packing:
+    game = Packing(64, size, sides=(1, 4), seed=5)
+    policy = make_policy("random", 2)
+    for _ in range(5):
+        game.place(*policy(game))
+    return game
+
+
+def mirrored_map(heightmap: Tensor, symmetry: int) -> Tensor:
+    if symmetry & 1:
+        heightmap = heightmap.flip(1)
+    if symmetry & 2:
+        heightmap = heightmap.flip(2)
+    return heightmap.transpose(1, 2) if symmetry & 4 else heightmap
+
+
+def in_mirrored_bin(game: Packing, symmetry: int) -> Packing:
+    """The same game in the mirrored bin: maps mirrored, the same items, masks made anew."""
+    size = (game.size[1], game.size[0], game.size[2]) if symmetry & 4 else game.size
+    other = Packing(game.n, size, sides=(1, 4), seed=5)
+    other.bins.heightmap.copy_(mirrored_map(game.bins.heightmap, symmetry))
+    other.bins.empty_map.copy_(mirrored_map(game.bins.empty_map, symmetry))
+    other.items, other.weights = game.items, game.weights
+    other._look()
+    return other
+
+
+@pytest.mark.parametrize("symmetry", range(8))
+@pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
+def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symmetry: int) -> None:
+    game = played(SIZE)
+    other = in_mirrored_bin(game, symmetry)
+    chosen, cell = make_policy("random", 3)(game)
+    turned = chosen ^ 1 if symmetry & 4 else chosen
+    cells = SIZE[0] * SIZE[1]
+    kinds = torch.full((game.n,), symmetry)
+    if agent == "orientation":
+        seen, action = orientation.observe(game, PLANES), chosen
+        expected = orientation.observe(other, PLANES)
+    elif agent == "placement":
+        seen, action = placement.observe(game, PLANES, chosen), cell
+        expected = placement.observe(other, PLANES, turned)
+    else:
+        seen, action = joint.observe(game, PLANES), chosen * cells + cell
+        expected = joint.observe(other, PLANES)
+    moved, new = transform(seen, action[:, None].float(), agent, kinds)
+    for name, values in expected.items():
+        assert torch.equal(moved[name], values), name
+    if agent == "orientation":
+        assert torch.equal(new.squeeze(1).long(), turned)
+        return
+    # The box set down by the new action stands where the mirrored box would.
+    place = new.squeeze(1).long() % cells
+    before, after = game.bins.heightmap.clone(), other.bins.heightmap.clone()
+    game.place(chosen, cell)
+    other.place(turned, place)
+    going_on = (game.t > 0) & (other.t > 0)
+    raised = mirrored_map(game.bins.heightmap - before, symmetry)
+    assert going_on.any()
+    assert torch.equal(raised[going_on], (other.bins.heightmap - after)[going_on])
+
+
+def test_a_bin_that_is_not_square_is_mirrored() -> None:
+    game = played((7, 5, 8))
+    seen = orientation.observe(game, PLANES)
+    action = torch.zeros(game.n, 1)
+    twice, _ = transform(
+        *transform(seen, action, "orientation", torch.full((game.n,), 3)),
+        "orientation",
+        torch.full((game.n,), 3),
+    )
+    assert all(torch.equal(twice[name], seen[name]) for name in seen)

@@ -1,0 +1,179 @@
+"""The command that trains: stopping, going on, several processes, what it leaves behind."""
+
+import csv
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from marl_pack.agents import checkpoint
+from marl_pack.train import main
+
+SMALL = (
+    "--game.bin=[5,5,5]", "--game.sides=[1,3]", "--ppo.num_envs=8", "--ppo.num_steps_per_env=4",
+    "--ppo.num_mini_batches=2", "--orientation.network.channels=8", "--output.latest_every=1",
+    "--placement.network.channels=8", "--evaluation.episodes=16", "--evaluation.every=2",
+    "--output.name=run", "--output.keep_every=2",
+)  # fmt: skip
+
+
+def networks(run: Path) -> dict[str, Tensor]:
+    agents = checkpoint.read(run / "latest.pt")["agents"]
+    return {f"{a}.{n}": v for a, s in agents.items() for n, v in s["actor_state_dict"].items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def start(*options: str, python: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+    command = [sys.executable, *python, "-m", "marl_pack.train", *options]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )  # fmt: skip
+
+
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    for _ in range(1200):
+        if path.is_file():
+            return
+        assert process.poll() is None, process.stdout and process.stdout.read()
+        time.sleep(0.05)
+    raise AssertionError(f"{path} did not come")
+
+
+def test_a_run_leaves_settings_checkpoints_logs_and_history(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
+    run = tmp_path / "run"
+    names = {path.name for path in run.iterdir()}
+    assert {"config.yaml", "run.json", "latest.pt", "best.pt", "evaluations.csv",
+            "model_0.pt", "model_2.pt", "model_3.pt"} <= names  # fmt: skip
+    assert not [name for name in names if name.endswith(".part")]
+    record = json.loads((run / "run.json").read_text())
+    assert record["versions"]["torch"] == torch.__version__
+    rows = list(csv.DictReader((run / "evaluations.csv").open()))
+    assert [row["iteration"] for row in rows] == ["2", "4"]
+    assert [row["items"] for row in rows] == ["64", "128"]
+    found = checkpoint.read(run)
+    assert found["items"] in (64, 128)
+    assert max(float(row["utilization"]) for row in rows) == pytest.approx(
+        found["evaluations"][-1]["utilization"]
+        if found["items"] == int(rows[-1]["items"])
+        else float(rows[0]["utilization"])
+    )
+    shown = capsys.readouterr().out
+    assert "items/s" in shown
+    assert "evaluation after 4 iterations, 128 items" in shown
+    again = main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"])
+    assert again == 2
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_tensorboards_scalars_are_those_that_the_docs_define(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    assert main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
+    events = EventAccumulator(str(tmp_path / "run"))
+    events.Reload()
+    docs = (Path(__file__).parent.parent / "docs" / "training.md").read_text(encoding="utf-8")
+    for tag in events.Tags()["scalars"]:
+        named = tag.replace("orientation/", "AGENT/").replace("placement/", "AGENT/")
+        assert f"`{named}`" in docs, tag
+    last = events.Scalars("Train/utilization")[-1]
+    assert 0 < last.value < 1
+    assert last.step == 3
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    options = [*SMALL, "--ppo.max_iterations=12"]
+    assert main([*options, f"--output.folder={tmp_path / 'whole'}"]) == 0
+    process = start(*options, f"--output.folder={tmp_path / 'part'}")
+    run = tmp_path / "part" / "run"
+    wait_for(run / "model_4.pt", process)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.read(run / "latest.pt")["iter"] < 11
+    assert main(["--resume", str(run)]) == 0
+    assert same(networks(run), networks(tmp_path / "whole" / "run"))
+    columns = ("iteration", "items", "utilization")
+    histories = [
+        [[row[c] for c in columns] for row in csv.DictReader((path / "evaluations.csv").open())]
+        for path in (run, tmp_path / "whole" / "run")
+    ]
+    assert histories[0] == histories[1]
+
+
+def test_an_interrupt_ends_with_a_checkpoint(tmp_path: Path) -> None:
+    process = start(*SMALL, "--ppo.max_iterations=100000", f"--output.folder={tmp_path}")
+    run = tmp_path / "run"
+    wait_for(run / "model_2.pt", process)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"--resume {run}" in out.replace("\n", "")
+    assert "Traceback" not in out
+    assert checkpoint.read(run / "latest.pt")["iter"] >= 2
+
+
+def test_a_run_may_be_made_longer_but_not_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
+    run = str(tmp_path / "run")
+    assert main(["--resume", run, "--game.bin=[6,6,6]"]) == 2
+    told = capsys.readouterr().err
+    assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in told
+    assert main(["--resume", run, "--ppo.max_iterations=3"]) == 0
+    assert checkpoint.read(Path(run) / "latest.pt")["iter"] == 2
+    assert main(["--resume", run, "--config=configs/rs.yaml"]) == 2
+    assert main(["--resume", str(tmp_path / "nothing")]) == 2
+    assert "no such checkpoint" in capsys.readouterr().err
+    assert main(["--resume"]) == 2
+
+
+def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    script = tmp_path / "both.py"
+    script.write_text(
+        "import os, sys, torch\n"
+        "from marl_pack import train\n"
+        "from marl_pack.agents.runner import Runner\n"
+        "learned = Runner.train\n"
+        "def keep(self, iterations):\n"
+        "    learned(self, iterations)\n"
+        "    kept = {'weights': self.alg.save(), 'items': self.env.game.items}\n"
+        f"    torch.save(kept, r'{tmp_path}/rank' + os.environ['RANK'])\n"
+        "Runner.train = keep\n"
+        "sys.exit(train.main(sys.argv[1:]))\n"
+    )
+    environment = dict(os.environ, OMP_NUM_THREADS="1")
+    options = [*SMALL, "--ppo.max_iterations=3", f"--output.folder={tmp_path}"]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2",
+                f"--master_port={port}", str(script)]  # fmt: skip
+    done = subprocess.run([*torchrun, *options], env=environment, capture_output=True, text=True,
+                          timeout=300)  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    ranks = [torch.load(tmp_path / f"rank{rank}", weights_only=True) for rank in (0, 1)]
+    assert not torch.equal(ranks[0]["items"], ranks[1]["items"])
+    for agent, state in ranks[0]["weights"]["learners"].items():
+        for part in ("actor_state_dict", "critic_state_dict"):
+            assert same(state[part], ranks[1]["weights"]["learners"][agent][part])
+    found = checkpoint.read(tmp_path / "run" / "latest.pt")
+    assert found["items"] == 2 * 3 * 8 * 4
+    assert len(found["state"]) == 2
+    more = subprocess.run([*torchrun, "--resume", str(tmp_path / "run"), "--ppo.max_iterations=4"],
+                          env=environment, capture_output=True, text=True, timeout=300)  # fmt: skip
+    assert more.returncode == 0, more.stdout + more.stderr
+    assert main(["--resume", str(tmp_path / "run"), "--ppo.max_iterations=5"]) == 2
