@@ -142,7 +142,7 @@ class Evaluation:
 
     every: int = 20
     episodes: int = 1000
-    seed: int = 0
+    seed: int = 2024
 
 
 @dataclass
@@ -196,7 +196,7 @@ class Config:
     evaluation: Evaluation = field(default_factory=Evaluation)
     output: Output = field(default_factory=Output)
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain lists, dicts and values."""
         plain: dict[str, Any] = _plain(asdict(self))
         return plain
@@ -275,7 +275,7 @@ def _explained(parser: ArgumentParser) -> Iterator[None]:
         raise
     except ArgumentError as error:
         raise ConfigError(explain(parser, str(error))) from None
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise ConfigError(str(error)) from None
 
 
@@ -329,9 +329,11 @@ def check(config: Config) -> None:
                 "num_mini_batches"):  # fmt: skip
         if getattr(ppo, key) < 1:
             refuse(f"ppo.{key}", getattr(ppo, key), "needs 1 or more")
-    if ppo.num_mini_batches > ppo.num_envs * ppo.num_steps_per_env:
-        refuse("ppo.num_mini_batches", ppo.num_mini_batches,
-               f"an iteration has only {ppo.num_envs * ppo.num_steps_per_env} items")  # fmt: skip
+    if 2 * ppo.num_mini_batches > ppo.num_envs * ppo.num_steps_per_env:
+        refuse(
+            "ppo.num_mini_batches", ppo.num_mini_batches,
+            f"each needs 2 items, an iteration has only {ppo.num_envs * ppo.num_steps_per_env}",
+        )  # fmt: skip
     for key in ("gamma", "lam"):
         if not 0 <= getattr(ppo, key) <= 1:
             refuse(f"ppo.{key}", getattr(ppo, key), "needs a number from 0 to 1")
@@ -368,6 +370,8 @@ def check(config: Config) -> None:
     if config.orientation.frozen and config.placement.frozen:
         refuse("placement.frozen", "true", "both agents are frozen, so nothing would learn")
     game = config.game
+    if config.joint and not game.mask_orientations:
+        refuse("game.mask_orientations", "false", "the joint agent's pairs are always masked")
     try:
         check_size(game.bin)
     except ValueError as error:

@@ -137,6 +137,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 console.print(f"{name}: played by {agent['name']}, no network to export")
                 continue
             if chosen.format == "rsl_rl":
+                if "critic_state_dict" not in agent:
+                    console.print(f"{name}: was frozen, has no critic that rsl_rl could load")
+                    continue
                 path = folder / f"{name}.pt"
                 checkpoint.write(path, agent)
                 console.print(f"{path}: for rsl_rl's PPO.load", soft_wrap=True)

@@ -7,6 +7,7 @@ resolved settings, checkpoints, TensorBoard's logs and the history of evaluation
 
 from __future__ import annotations
 
+import argparse
 import csv
 import datetime
 import io
@@ -89,8 +90,13 @@ def make_game(
     )  # fmt: skip
 
 
-def runner_settings(config: Config) -> dict[str, Any]:
-    """What :class:`marl_pack.agents.runner.Runner` takes, from the settings."""
+def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What :class:`marl_pack.agents.runner.Runner` takes, from the settings.
+
+    Args:
+        config: the settings.
+        found: the checkpoint of the run to go on with: it holds the frozen agents.
+    """
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
     symmetry, final_entropy = ppo.pop("symmetry"), ppo.pop("final_entropy_coef")
@@ -98,9 +104,15 @@ def runner_settings(config: Config) -> dict[str, Any]:
     schedule = ppo.pop("schedule")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
-    def agent(own: Agent) -> dict[str, Any]:
+    def agent(name: str, own: Agent) -> dict[str, Any]:
         if own.frozen:
-            return {"frozen": own.policy}
+            assert own.policy is not None, "the settings were checked"
+            kept = (
+                checkpoint.frozen_agent(own.policy, name)
+                if found is None
+                else (found["agents"][name])
+            )
+            return {"frozen": kept}
         rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
         entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
         last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef
@@ -128,14 +140,19 @@ def runner_settings(config: Config) -> dict[str, Any]:
         "algorithm": {
             "class_name": "marl_pack.agents.ppo:PackingPPO", "iterations": iterations,
         },
-        "agents": {name: agent(own) for name, own in agents.items()},
+        "agents": {name: agent(name, own) for name, own in agents.items()},
         "latest_every": config.output.latest_every,
         "evaluate_every": config.evaluation.every,
     }  # fmt: skip
 
 
-def make_runner(config: Config, folder: Path | None, **reports: Callable[..., Any]) -> Runner:
-    """The environment, the agents and the runner of a run.
+def make_runner(
+    config: Config,
+    folder: Path | None,
+    found: Mapping[str, Any] | None = None,
+    **reports: Callable[..., Any],
+) -> Runner:
+    """The environment, the agents and the runner of a run, gone on with if ``found`` is given.
 
     Raises:
         ConfigError: if a setting cannot be.
@@ -146,7 +163,10 @@ def make_runner(config: Config, folder: Path | None, **reports: Callable[..., An
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device = {config.device}: {error}") from None
     torch.manual_seed(config.seed)
-    settings = runner_settings(config)
+    try:
+        settings = runner_settings(config, found)
+    except (ValueError, FileNotFoundError) as error:
+        raise ConfigError(str(error)) from None
     planes = {
         name: agent["network"]["planes"]
         for name, agent in settings["agents"].items()
@@ -157,11 +177,13 @@ def make_runner(config: Config, folder: Path | None, **reports: Callable[..., An
             config, config.ppo.num_envs, derived_seed(config.seed, rank()), auto_reset=True,
             device=device,
         )  # fmt: skip
-        env = PackingVecEnv(game, planes, config.as_dict())
-        runner = Runner(env, settings, folder, device, config=config.as_dict(), **reports)
+        env = PackingVecEnv(game, planes, config)
+        runner = Runner(env, settings, folder, device, config=config.to_dict(), **reports)
+        torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
+        if found is not None:
+            runner.resume(found)
     except (ValueError, FileNotFoundError) as error:
         raise ConfigError(str(error)) from None
-    torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
     return runner
 
 
@@ -247,32 +269,35 @@ def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
 
 def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
     """Keep the settings, and what ran them, beside the checkpoints."""
-    text = yaml.safe_dump(config.as_dict(), sort_keys=False)
+    text = yaml.safe_dump(config.to_dict(), sort_keys=False)
     write_atomically(folder / "config.yaml", lambda file: file.write(text.encode()))
     versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
     versions |= {name: metadata.version(name) for name in PACKAGES}
-    record = {
+    path = folder / "run.json"
+    before = json.loads(path.read_text()) if path.is_file() else None
+    record: dict[str, Any] = {
         "arguments": list(arguments),
         "seed": config.seed,
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "processes": int(os.environ.get("WORLD_SIZE", "1")),
         "versions": versions,
     }
+    if before is not None:  # gone on with: keep how it began
+        before.setdefault("resumed", []).append(record)
+        record = before
     record_text = json.dumps(record, indent=2) + "\n"
-    write_atomically(folder / "run.json", lambda file: file.write(record_text.encode()))
+    write_atomically(path, lambda file: file.write(record_text.encode()))
 
 
 def new_folder(config: Config) -> Path:
-    """The folder of a new run; all processes of a run name the same one.
+    """The folder of a new run.
 
     Raises:
         ConfigError: if there is a run in it.
     """
     name = config.output.name
     if name is None:
-        stamp = os.environ.get("TORCHELASTIC_RUN_ID", "")
-        name = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        name = f"{name}_seed{config.seed}" if stamp in ("", "none") else stamp
+        name = f"{datetime.datetime.now():%Y-%m-%d_%H-%M-%S}_seed{config.seed}"
     folder = Path(config.output.folder) / name
     if (folder / checkpoint.LATEST).exists():
         raise ConfigError(
@@ -288,12 +313,15 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
         ConfigError, ValueError, FileNotFoundError: if it cannot be resumed so.
     """
     folder = Path(run)
-    found = checkpoint.read(folder / checkpoint.LATEST if folder.is_dir() else folder)
+    try:
+        found = checkpoint.read(folder / checkpoint.LATEST if folder.is_dir() else folder)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
     kept = from_dict(found["config"])
-    config, options = parse(["--config", yaml.safe_dump(kept.as_dict()), *arguments])
+    config, options = parse(["--config", yaml.safe_dump(kept.to_dict()), *arguments])
     if len(options.config or []) > 1:
         raise ConfigError("--resume: the run has its own settings; give no --config beside it")
-    before, after = _flat(kept.as_dict()), _flat(config.as_dict())
+    before, after = _flat(kept.to_dict()), _flat(config.to_dict())
     for key, value in after.items():
         if value != before[key] and not key.startswith(MAY_CHANGE):
             raise ConfigError(
@@ -340,17 +368,16 @@ def train(
         write_history(folder / "evaluations.csv", history)
         display.evaluated(history[-1])
 
-    folder.mkdir(parents=True, exist_ok=True)
     runner = make_runner(
         config,
         folder,
+        found,
         evaluate=lambda made: evaluation(config, made),
         show=display.show if rank() == 0 else lambda progress: None,
         evaluated=evaluated,
     )
-    if found is not None:
-        runner.resume(found)
     if rank() == 0:
+        folder.mkdir(parents=True, exist_ok=True)
         write_record(folder, config, sys.argv[1:])
 
     def stop(number: int, frame: object) -> None:
@@ -380,51 +407,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     console = Console()
     try:
-        config, options = parse(given) if "--resume" not in " ".join(given) else (None, None)
+        run, rest = _resume_option(given)
         found = None
-        if config is None:
-            run, rest = _resume_option(given)
+        if run is not None:
             config, found = resumed(run, rest)
             folder = Path(run) if Path(run).is_dir() else Path(run).parent
         else:
+            config, _ = parse(given)
             folder = new_folder(config)
-        del options
         runner = train(config, folder, console if rank() == 0 else Console(quiet=True), found)
     except RunInterruptedError:
-        console.print(f"stopped with a checkpoint; go on with --resume {folder}")
+        if rank() == 0:
+            console.print(
+                f"stopped with a checkpoint; go on with --resume {folder}", soft_wrap=True
+            )
         return 130
     except KeyboardInterrupt:
         console.print("stopped at once; the last checkpoint is as it was")
         return 130
-    except (ConfigError, ValueError, FileNotFoundError) as error:
+    except (ConfigError, FileNotFoundError, ModuleNotFoundError) as error:
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 2
     if rank() == 0:
         console.print(
             f"done: {runner.logger.tot_timesteps:,} items; play it with "
-            f"python -m marl_pack.evaluate --policy {folder}"
+            f"python -m marl_pack.evaluate --policy {folder}",
+            soft_wrap=True,
         )
     return 0
 
 
-def _resume_option(given: Sequence[str]) -> tuple[str, list[str]]:
-    """The folder after --resume, and the other options.
+def _resume_option(given: Sequence[str]) -> tuple[str | None, list[str]]:
+    """What follows --resume, None without it, and the other options.
 
     Raises:
-        ConfigError: if none is given.
+        ConfigError: if nothing follows it.
     """
-    rest, run = [], None
-    words = iter(given)
-    for word in words:
-        if word == "--resume":
-            run = next(words, None)
-        elif word.startswith("--resume="):
-            run = word.partition("=")[2]
-        else:
-            rest.append(word)
-    if not run:
+    first = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
+    first.add_argument("--resume")
+    try:
+        known, rest = first.parse_known_args(given)
+    except argparse.ArgumentError:
+        raise ConfigError("--resume needs a run's folder") from None
+    if known.resume == "":
         raise ConfigError("--resume needs a run's folder")
-    return run, rest
+    return known.resume, rest
 
 
 if __name__ == "__main__":

@@ -24,21 +24,21 @@ class PackingVecEnv(VecEnv):
         game: N bins.
         planes: extra planes for each agent (:data:`marl_pack.agents.trunk.PLANES`), by its name.
             With the key ``joint``, the first turn is the joint agent's and there is no second.
-        cfg: what the run's settings were, for the logger.
+        cfg: the run's settings, for the logger: an object with ``to_dict``.
 
     Raises:
         ValueError: if the game does not begin new episodes by itself.
     """
 
     def __init__(
-        self, game: Packing, planes: Mapping[str, Sequence[str]], cfg: dict[str, Any] | None = None
+        self, game: Packing, planes: Mapping[str, Sequence[str]], cfg: object = None
     ) -> None:
         if not game.auto_reset:
             raise ValueError("a game for training needs auto_reset=True")
         self.game, self.planes = game, dict(planes)
         self.num_envs, self.num_actions = game.n, 2
         self.device = game.device
-        self.cfg = cfg or {}
+        self.cfg = {} if cfg is None else cfg
         self.max_episode_length = game.bins.boxes.shape[1]
         self._heightmap: Tensor | None = None  # the copy that this step's observations share
 
@@ -46,6 +46,10 @@ class PackingVecEnv(VecEnv):
     def episode_length_buf(self) -> Tensor:
         """Items placed in each bin, int64 [N]."""
         return self.game.t
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        raise ValueError("an episode cannot begin in its middle: leave init_at_random_ep_len False")
 
     def get_observations(self) -> TensorDict:
         """What the first agent sees: groups as :func:`marl_pack.agents.orientation.observe`."""

@@ -86,6 +86,18 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
         checkpoint.read(tmp_path / "none.pt")
     with pytest.raises(FileNotFoundError, match=r"neither best\.pt nor latest\.pt"):
         checkpoint.read(tmp_path)
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 255
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match="can be read"):
+        checkpoint.read(path)
+    torch.save({"format": 1, "agents": []}, path)
+    with pytest.raises(ValueError, match=r"not a checkpoint of marl_pack\.train"):
+        checkpoint.read(path)
+    with pytest.raises(ValueError, match="orientation agent's weights do not fit"):
+        checkpoint.load_actor(
+            {"agents": {"orientation": {"network": {"c": 1}}}}, "orientation", "cpu"
+        )
     found["agents"]["placement"]["network"]["channels"] = 16
     with pytest.raises(ValueError, match="placement agent's weights do not fit"):
         checkpoint.load_policy(found)

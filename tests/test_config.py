@@ -42,7 +42,7 @@ def test_every_key_of_a_config_has_a_comment_above_it(path: Path) -> None:
 
 def test_the_main_config_holds_every_key_at_its_default() -> None:
     written = yaml.safe_load((CONFIGS / "rs.yaml").read_text(encoding="utf-8"))
-    defaults = Config().as_dict()
+    defaults = Config().to_dict()
     for name in ("max_iterations",):  # how long it runs is the file's own
         written["ppo"].pop(name)
         defaults["ppo"].pop(name)
@@ -68,7 +68,7 @@ def test_the_rules_are_those_there_are() -> None:
 def test_settings_go_to_plain_values_and_back() -> None:
     config, _ = parse(["--game.bin=[6,7,8]", "--placement.network.planes=[rest]", "--seed=5",
                        "--orientation.frozen=true", "--orientation.policy=first"])  # fmt: skip
-    again = from_dict(yaml.safe_load(yaml.safe_dump(config.as_dict())))
+    again = from_dict(yaml.safe_load(yaml.safe_dump(config.to_dict())))
     assert again == config
     assert again.game.bin == (6, 7, 8)
     assert again.orientation == Agent(frozen=True, policy="first")
@@ -85,7 +85,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--ppo.learning_rate=.nan"], r"ppo\.learning_rate = nan: needs a positive"),
     (["--placement.entropy_coef=-1"], r"placement = -1\.0"),
     (["--ppo.num_envs=0"], r"ppo\.num_envs = 0: needs 1 or more"),
-    (["--ppo.num_envs=1", "--ppo.num_steps_per_env=2"], r"only 2 items"),
+    (["--ppo.num_envs=1", "--ppo.num_steps_per_env=2"], r"an iteration has only 2"),
     (["--threads=0"], r"threads = 0"),
     (["--evaluation.every=-1"], r"evaluation\.every"),
     (["--evaluation.episodes=1"], r"evaluation\.episodes"),
@@ -99,6 +99,8 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.network.layers=0"], r"layers = 0"),
     (["--ppo.symmetry=true", "--game.com_offset=[0.1,0,0]"], r"ppo\.symmetry.*off centre"),
     (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
+    (["--joint=true", "--game.mask_orientations=false"], r"mask_orientations.*always masked"),
+    (["--ppo=null"], r"ppo"),
 ])  # fmt: skip
 def test_a_mistake_is_named_with_what_would_be_right(options: list[str], told: str) -> None:
     with pytest.raises(ConfigError, match=told):

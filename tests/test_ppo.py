@@ -12,9 +12,11 @@ from marl_pack import evaluate
 from marl_pack.agents import checkpoint
 from marl_pack.agents.policy import Policy
 from marl_pack.agents.runner import RunInterruptedError, Runner
+from marl_pack.agents.symmetry import see_through_symmetries
+from marl_pack.bins import ORIENTATIONS
 from marl_pack.config import Config, parse
 from marl_pack.packing import Packing
-from marl_pack.train import make_game, make_runner
+from marl_pack.train import evaluation, make_game, make_runner
 
 TINY = (
     "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=16", "--ppo.num_steps_per_env=4",
@@ -50,6 +52,7 @@ def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
         for _ in range(4):
             game = env.game
             mask, items = game.mask.clone(), game.items.clone()
+            heights = game.bins.heightmap.clone()
             actions = alg.act(obs)
             obs, reward, done, extras = env.step(actions)
             alg.process_env_step(obs, reward, done, extras)
@@ -61,6 +64,8 @@ def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
             assert torch.equal(first.actions[step, :, 0].long(), o)
             assert torch.equal(second.actions[step, :, 0].long(), actions[:, 1])
             assert torch.equal(first.observations["item"][step], items)
+            for storage in (first, second):
+                assert torch.equal(storage.observations["heightmap"][step], heights)
             legal = mask[torch.arange(16), o]
             assert torch.equal(second.observations["mask"][step], legal.flatten(1))
             assert legal.flatten(1).gather(1, actions[:, 1:]).all()
@@ -71,7 +76,7 @@ def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
 
 
 def test_advantages_are_those_worked_by_hand() -> None:
-    runner = make_runner(tiny("--ppo.gamma=0.5", "--ppo.lam=0.5", "--ppo.num_envs=1",
+    runner = make_runner(tiny("--ppo.gamma=0.5", "--ppo.lam=0.5", "--ppo.num_envs=1", "--ppo.num_mini_batches=1",
                               "--ppo.num_steps_per_env=3"), None)  # fmt: skip
     for name, ppo in runner.alg.learners.items():
         storage = ppo.storage
@@ -95,9 +100,25 @@ def test_advantages_are_those_worked_by_hand() -> None:
 def test_the_last_states_value_is_of_an_orientation_drawn_there_and_nothing_moves() -> None:
     runner = make_runner(tiny(), None)
     before = runner.env.game.state_dict()
+    seen = {}
+    placement = runner.alg.learners["placement"]
+    placement.compute_returns = lambda obs: seen.update(obs.items())
     with torch.inference_mode():
         runner.alg.compute_returns(runner.env.get_observations())
     assert same(before, runner.env.game.state_dict())
+    drawn = runner.alg.learners["orientation"].actor.distribution
+    assert drawn.log_probs.shape == (16, 6)
+    sides = before["items"].gather(1, torch.tensor(ORIENTATIONS)[_orientations(seen, before)])
+    assert torch.equal(sides, seen["item"])
+    assert len(seen["item"].unique(dim=0)) > 1
+    assert seen["mask"].any(1).all(), "a drawn orientation is legal"
+    assert (_orientations(seen, before) > 0).any(), "not the first one always"
+
+
+def _orientations(seen: dict[str, Tensor], before: dict[str, Tensor]) -> Tensor:
+    """The first orientation that gives each item the sides that are seen."""
+    turned = before["items"][:, torch.tensor(ORIENTATIONS)]  # [N, 6, 3]
+    return (turned == seen["item"][:, None]).all(2).int().argmax(1)
 
 
 def test_learning_rate_and_entropy_follow_their_schedules() -> None:
@@ -187,6 +208,69 @@ def test_a_frozen_networks_weights_do_not_move_and_the_others_do(
     kept = second.checkpoint()["agents"][frozen]
     assert same(kept["actor_state_dict"], first.checkpoint()["agents"][frozen]["actor_state_dict"])
     assert "optimizer_state_dict" not in kept
+    # It is that network which plays, its most probable action.
+    game = second.env.game
+    with torch.inference_mode():
+        actions = second.alg.act(second.env.get_observations())
+    if frozen == "orientation":
+        plays = checkpoint.find_orientation_agent(str(path))(game)
+        assert torch.equal(actions[:, 0], plays)
+    else:
+        plays = checkpoint.find_placement_agent(str(path))(game, actions[:, 0])
+        assert torch.equal(actions[:, 1], plays)
+
+
+def test_a_run_with_a_frozen_network_goes_on_without_the_old_file(tmp_path: Path) -> None:
+    first = make_runner(tiny(), None)
+    path = tmp_path / "first.pt"
+    checkpoint.write(path, first.checkpoint())
+    config = tiny("--placement.frozen=true", f"--placement.policy={path}")
+    second = make_runner(config, tmp_path / "run")
+    second.train(1)
+    path.unlink()
+    found = checkpoint.read(tmp_path / "run" / "latest.pt")
+    resumed = make_runner(config, None, found)
+    resumed.train(2)
+    weights_kept = resumed.checkpoint()["agents"]["placement"]["actor_state_dict"]
+    assert same(weights_kept, found["agents"]["placement"]["actor_state_dict"])
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
+    """Else the KL that the adaptive schedule sees is huge, and the learning rate collapses."""
+    config = tiny("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--ppo.desired_kl=0.02",
+                  f"--joint={str(joint).lower()}")  # fmt: skip
+    runner = make_runner(config, None)
+    runner.train(3)
+    for name, ppo in runner.alg.learners.items():
+        assert ppo.learning_rate > 7e-4, name
+    with torch.inference_mode():
+        obs = runner.env.get_observations()
+        for _ in range(4):
+            actions = runner.alg.act(obs)
+            obs, *rest = runner.env.step(actions)
+            runner.alg.process_env_step(obs, *rest)
+    for name, ppo in runner.alg.learners.items():
+        see_through_symmetries(ppo, name)
+        storage = ppo.storage
+        for step in range(4):
+            seen = storage.observations[step]
+            ppo.actor(seen, stochastic_output=True)
+            log_prob = ppo.actor.get_output_log_prob(storage.actions[step])
+            assert torch.allclose(log_prob, storage.actions_log_prob[step, :, 0], atol=1e-5)
+            assert (log_prob > -30).all(), "the moved action is legal in what is seen"
+
+
+def test_how_often_a_run_is_evaluated_does_not_change_its_weights(tmp_path: Path) -> None:
+    made = []
+    for every in (0, 1):
+        config = tiny(f"--evaluation.every={every}", "--evaluation.episodes=4")
+        runner = make_runner(
+            config, tmp_path / str(every), evaluate=lambda found, c=config: evaluation(c, found)
+        )
+        runner.train(3)
+        made.append(weights(runner, "placement"))
+    assert same(*made)
 
 
 def test_a_critic_with_a_trunk_of_its_own_and_symmetry_learn_too() -> None:
@@ -216,8 +300,8 @@ def test_a_resumed_run_gives_the_weights_of_one_never_stopped(
     with pytest.raises(RunInterruptedError):
         part.train(5)
     torch.manual_seed(12345)
-    resumed = make_runner(config, tmp_path / "part")
-    resumed.resume(checkpoint.read(tmp_path / "part" / "latest.pt"))
+    found = checkpoint.read(tmp_path / "part" / "latest.pt")
+    resumed = make_runner(config, tmp_path / "part", found)
     assert resumed.current_learning_iteration == 2
     resumed.train(5)
     for name in whole.alg.learners:

@@ -141,6 +141,33 @@ def test_a_run_may_be_made_longer_but_not_another(
     assert main(["--resume"]) == 2
 
 
+def test_weights_and_biases_get_the_settings_and_the_scalars(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a stand-in for the package, which needs an account."""
+    from rsl_rl.utils import wandb_log_writer
+
+    told: dict[str, object] = {}
+
+    class Settings:
+        def update(self, values: dict[str, object]) -> None:
+            told.update(values)
+
+    class Wandb:
+        config = Settings()
+
+        def __getattr__(self, name: str) -> object:
+            return lambda *args, **named: told.update(args[0]) if name == "log" else None
+
+    monkeypatch.setattr(wandb_log_writer, "wandb", Wandb())
+    options = [*SMALL, "--ppo.max_iterations=2", "--output.logger=wandb"]
+    assert main([*options, f"--output.folder={tmp_path}"]) == 0
+    assert told["env_cfg"]["game"]["bin"] == [5, 5, 5]
+    assert "Train/utilization" in told
+    monkeypatch.setattr(wandb_log_writer, "wandb", None)
+    assert main([*options, f"--output.folder={tmp_path / 'without'}"]) == 2
+
+
 def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -80,11 +80,19 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
             "use another of the run's files"
         )
     try:
+        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
+            if archive.testzip() is not None:
+                raise ValueError("damaged")
         found = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:
         first = str(error).strip().splitlines()[:1]
         raise ValueError(f"{path}: not a checkpoint that can be read ({first})") from None
-    if not isinstance(found, dict) or "format" not in found or "agents" not in found:
+    parts = ("format", "agents", "config", "iter", "items")
+    if (
+        not isinstance(found, dict)
+        or any(part not in found for part in parts)
+        or not isinstance(found["agents"], dict)
+    ):
         raise ValueError(f"{path}: not a checkpoint of marl_pack.train")
     if found["format"] != FORMAT:
         raise ValueError(
@@ -106,12 +114,13 @@ def load_actor(found: Mapping[str, Any], name: str, device: torch.device | str) 
     """
     agent = found["agents"].get(name)
     if agent is None or "network" not in agent:
-        has = ", ".join(k for k, v in found["agents"].items() if "network" in v)
+        has = ", ".join(k for k, v in found["agents"].items() if "network" in v) or "none"
         raise ValueError(f"the checkpoint has no learned {name} agent; it has: {has}")
-    actor = make_actor(name, agent["network"], device)
     try:
+        with torch.random.fork_rng(devices=[]):  # fresh weights draw numbers that a run needs
+            actor = make_actor(name, agent["network"], device)
         actor.load_state_dict(agent["actor_state_dict"])
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, KeyError) as error:
         raise ValueError(f"the {name} agent's weights do not fit its network: {error}") from None
     return actor.eval()
 
@@ -157,24 +166,26 @@ def load_policy(
     """
     if "joint" in found["agents"]:
         return learned_joint_policy(load_actor(found, "joint", device))
-    return in_turns(_orientation_agent(found, device, seed), _placement_agent(found, device, seed))
+    return in_turns(orientation_agent(found, device, seed), placement_agent(found, device, seed))
 
 
-def _orientation_agent(
-    found: Mapping[str, Any], device: torch.device | str, seed: int | None
+def orientation_agent(
+    found: Mapping[str, Any], device: torch.device | str, seed: int | None = 0
 ) -> OrientationAgent:
+    """The first agent of a checkpoint (of its ``agents`` alone, too). Arguments as above."""
     if "joint" in found["agents"]:
         policy = learned_joint_policy(load_actor(found, "joint", device))
         return lambda game: policy(game)[0]
-    rule = found["agents"]["orientation"].get("name")
+    rule = found["agents"].get("orientation", {}).get("name")
     if rule is not None:
         return make_orientation_agent(rule, seed, device)
     return learned_orientation_agent(load_actor(found, "orientation", device))
 
 
-def _placement_agent(
-    found: Mapping[str, Any], device: torch.device | str, seed: int | None
+def placement_agent(
+    found: Mapping[str, Any], device: torch.device | str, seed: int | None = 0
 ) -> PlacementAgent:
+    """The second agent of a checkpoint (of its ``agents`` alone, too). Arguments as above."""
     rule = found["agents"].get("placement", {}).get("name")
     if rule is not None:
         return make_placement_agent(rule, seed, device)
@@ -198,7 +209,7 @@ def find_orientation_agent(
     """The first agent: one of :data:`ORIENTATION_AGENTS`, or a checkpoint's."""
     if source in ORIENTATION_AGENTS:
         return make_orientation_agent(source, seed, device)
-    return _orientation_agent(read(_path(source, ORIENTATION_AGENTS), device), device, seed)
+    return orientation_agent(read(_path(source, ORIENTATION_AGENTS), device), device, seed)
 
 
 def find_placement_agent(
@@ -207,7 +218,7 @@ def find_placement_agent(
     """The second agent: one of :data:`POLICIES`, or a checkpoint's."""
     if source in POLICIES:
         return make_placement_agent(source, seed, device)
-    return _placement_agent(read(_path(source, POLICIES), device), device, seed)
+    return placement_agent(read(_path(source, POLICIES), device), device, seed)
 
 
 def trained_on(source: str) -> str:

@@ -44,10 +44,15 @@ class MaskedCategorical(Distribution):
         """One action a row, float [B, 1]."""
         # Inverse CDF: several times cheaper than torch.multinomial. The point is below the total
         # (rand() < 1, and so after rounding), and the first entry above it has a probability
-        # greater than 0, so it is legal.
-        total = self.log_probs.exp().cumsum(-1)
+        # greater than 0, so it is legal where sums are taken in order. A parallel sum may round
+        # otherwise; then the best action stands in.
+        probabilities = self.log_probs.exp()
+        total = probabilities.cumsum(-1)
         point = torch.rand_like(total[:, :1]) * total[:, -1:]
-        return torch.searchsorted(total, point, right=True).to(total.dtype)
+        drawn = torch.searchsorted(total, point, right=True).clamp(max=total.shape[-1] - 1)
+        possible = probabilities.gather(-1, drawn) > 0
+        best = probabilities.argmax(-1, keepdim=True)
+        return torch.where(possible, drawn, best).to(total.dtype)
 
     def deterministic_output(self, mlp_output: Tensor) -> Tensor:
         """The most probable action a row (the first of equals), float [B, 1]."""

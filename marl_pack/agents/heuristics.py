@@ -139,8 +139,8 @@ def make_orientation_agent(
 ) -> OrientationAgent:
     """The first agent alone: ``random``, ``first`` or what a heuristic would choose.
 
-    ``first`` leaves the item as it comes (orientation 0), or takes the first legal orientation
-    where it could not stand so. Arguments as :func:`make_policy`.
+    ``first`` leaves the item as it comes (orientation 0), or takes the first orientation that may
+    be chosen where it could not stand so. Arguments as :func:`make_policy`.
 
     Raises:
         ValueError: for an unknown name.

@@ -18,11 +18,10 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from marl_pack.agents import joint
-from marl_pack.agents.checkpoint import find_orientation_agent, find_placement_agent
+from marl_pack.agents import checkpoint, joint
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import OrientationAgent, PlacementAgent
-from marl_pack.agents.symmetry import SymmetricStorage
+from marl_pack.agents.symmetry import see_through_symmetries
 from marl_pack.vec_env import PackingVecEnv
 
 KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
@@ -118,6 +117,8 @@ class PackingPPO:
         losses: dict[str, float] = {}
         for name, ppo in self.learners.items():
             self.anneal(name)
+            if self.schedules[name]["symmetry"]:
+                see_through_symmetries(ppo, name)
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
             losses[f"{name}/kl"] = self._divergence(ppo)
             losses[f"{name}/learning_rate"] = ppo.learning_rate
@@ -140,7 +141,7 @@ class PackingPPO:
         """Mean KL(old || new) over states of the last rollout, spread evenly through it."""
         storage = ppo.storage
         total = storage.num_envs * storage.num_transitions_per_env
-        chosen = torch.arange(0, total, max(1, total // KL_SAMPLES), device=storage.device)
+        chosen = torch.arange(0, total, -(-total // KL_SAMPLES), device=storage.device)
         with torch.inference_mode():
             ppo.actor(storage.observations.flatten(0, 1)[chosen], stochastic_output=True)
             old = tuple(p.flatten(0, 1)[chosen] for p in storage.distribution_params)
@@ -205,26 +206,26 @@ class PackingPPO:
             obs: an observation.
             env: the bins.
             cfg: ``algorithm`` with ``iterations``; ``agents``: for each agent either ``frozen``
-                (its name or checkpoint) or ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule``
-                and ``symmetry``.
+                (what a checkpoint keeps of it) or ``network``, ``algorithm`` (rsl_rl's PPO),
+                ``schedule`` and ``symmetry``.
             device: of the networks.
         """
         learners, schedules = {}, {}
-        sources: dict[str, str] = {}
+        frozen: dict[str, Any] = {}
         for name, settings in cfg["agents"].items():
             if settings.get("frozen"):
-                sources[name] = settings["frozen"]
+                frozen[name] = settings["frozen"]
                 continue
             seen = obs
             if name == "placement":
                 seen = env.orient(torch.zeros(env.num_envs, dtype=torch.int64, device=env.device))
             learners[name] = _stock_ppo(name, settings, seen, env, cfg, device)
-            schedules[name] = settings["schedule"]
+            schedules[name] = {**settings["schedule"], "symmetry": settings["symmetry"]}
         orientation_agent = placement_agent = None
-        if "orientation" in sources:
-            orientation_agent = find_orientation_agent(sources["orientation"], device, None)
-        if "placement" in sources:
-            placement_agent = find_placement_agent(sources["placement"], device, None)
+        if "orientation" in frozen:
+            orientation_agent = checkpoint.orientation_agent({"agents": frozen}, device, None)
+        if "placement" in frozen:
+            placement_agent = checkpoint.placement_agent({"agents": frozen}, device, None)
         iterations = cfg["algorithm"]["iterations"]
         return PackingPPO(learners, orientation_agent, placement_agent, env, schedules, iterations)
 
@@ -254,9 +255,4 @@ def _stock_ppo(
     }
     alone = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
-        ppo = PPO.construct_algorithm(obs, alone, agent_cfg, device)
-    if settings["symmetry"]:
-        ppo.storage = SymmetricStorage(
-            name, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [1], device
-        )
-    return ppo
+        return PPO.construct_algorithm(obs, alone, agent_cfg, device)

@@ -19,9 +19,11 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 import marl_pack
 from marl_pack.agents import checkpoint
+from marl_pack.agents.policy import Policy
 from marl_pack.agents.ppo import PackingPPO
 from marl_pack.vec_env import PackingVecEnv
 
@@ -122,7 +124,7 @@ class Runner(OnPolicyRunner):
         self.stop_requested = False
         self.last_iteration = 0  # of this call of learn()
         self._frozen = {
-            name: checkpoint.frozen_agent(settings["frozen"], name)
+            name: settings["frozen"]
             for name, settings in train_cfg["agents"].items()
             if settings.get("frozen")
         }
@@ -212,7 +214,11 @@ class Runner(OnPolicyRunner):
             random["cuda"] = torch.cuda.get_rng_state(self.device)
         logger = {name: getattr(self.logger, name) for name in LOGGER_STATE}
         logger |= {name: list(getattr(self.logger, name)) for name in LOGGER_BUFFERS}
-        return {"game": self.env.game.state_dict(), "random": random, "logger": logger}
+        kept = {"game": self.env.game.state_dict(), "random": random, "logger": logger}
+        on_cpu: dict[str, Any] = tree_map(
+            lambda value: value.cpu() if torch.is_tensor(value) else value, kept
+        )
+        return on_cpu
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         """Write a checkpoint; rsl_rl calls this every ``save_interval`` iterations."""
@@ -262,6 +268,20 @@ class Runner(OnPolicyRunner):
         torch.set_rng_state(own["random"]["cpu"].cpu())
         if "cuda" in own["random"]:
             torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
+
+    def get_inference_policy(self, device: str | None = None) -> Policy:
+        """The policy as it is now, each agent taking its most probable action."""
+        return checkpoint.load_policy(self.checkpoint(), device or self.device)
+
+    def export_policy_to_onnx(self, path: str, *args: Any, **named: Any) -> None:
+        """Refused: there is more than one policy, and masks, which rsl_rl's exporter does not know.
+
+        Raises:
+            NotImplementedError: always; ``python -m marl_pack.export`` writes the agents.
+        """
+        raise NotImplementedError("use python -m marl_pack.export on a checkpoint")
+
+    export_policy_to_jit = export_policy_to_onnx
 
     # --- several processes ------------------------------------------------------------------------
 

@@ -7,11 +7,10 @@ which moves with the item's sides; exchanging x and y also exchanges orientation
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from typing import Any
 
 import torch
-from rsl_rl.storage import RolloutStorage
+from rsl_rl.algorithms import PPO
 from torch import Tensor
 
 from marl_pack.bins import oriented
@@ -19,30 +18,33 @@ from marl_pack.bins import oriented
 MAPS = ("cells", "rest", "waste")  # observations [B, A, W, D] that lie at low corners
 
 
-class SymmetricStorage(RolloutStorage):
-    """rsl_rl's storage whose minibatches are seen through a symmetry drawn for each sample.
+def see_through_symmetries(ppo: PPO, agent: str) -> None:
+    """Show a rollout to its update through a symmetry of the bin drawn for each sample.
+
+    Rewards and returns are as they were. The old log-probabilities, distributions and values become
+    those of what is seen now, so that the update begins from ratios of 1.
 
     Args:
-        agent: ``orientation``, ``placement`` or ``joint``: what the actions are.
-        *args: as :class:`rsl_rl.storage.RolloutStorage`.
+        ppo: whose storage is full.
+        agent: ``orientation``, ``placement`` or ``joint``.
     """
-
-    def __init__(self, agent: str, *args: object) -> None:
-        super().__init__(*args)
-        self.agent = agent
-
-    def mini_batch_generator(
-        self, num_mini_batches: int, num_epochs: int = 8
-    ) -> Generator[RolloutStorage.Batch, None, None]:
-        """Stock minibatches, transformed; the old log-probabilities stay those of the original."""
-        for batch in super().mini_batch_generator(num_mini_batches, num_epochs):
-            heightmap = batch.observations["heightmap"]
-            kinds = 8 if heightmap.shape[1] == heightmap.shape[2] else 4
-            symmetry = torch.randint(kinds, (len(heightmap),), device=heightmap.device)
-            batch.observations, batch.actions = transform(
-                batch.observations, batch.actions, self.agent, symmetry
-            )
-            yield batch
+    storage = ppo.storage
+    with torch.inference_mode():
+        for step in range(storage.num_transitions_per_env):
+            seen = storage.observations[step]
+            width, depth = seen["heightmap"].shape[1:]
+            kinds = 8 if width == depth else 4
+            symmetry = torch.randint(kinds, (storage.num_envs,), device=storage.device)
+            moved, actions = transform(seen, storage.actions[step], agent, symmetry)
+            seen.copy_(moved)
+            storage.actions[step].copy_(actions)
+            ppo.actor(seen, stochastic_output=True)
+            storage.values[step].copy_(ppo.critic(seen))
+            log_prob = ppo.actor.get_output_log_prob(actions)
+            storage.actions_log_prob[step].copy_(log_prob[:, None])
+            new = ppo.actor.output_distribution_params
+            for kept, parameter in zip(storage.distribution_params, new, strict=True):
+                kept[step].copy_(parameter)
 
 
 def transform(

@@ -1,0 +1,59 @@
+"""What each agent brings: ``python -m benchmarks.ablations`` trains and compares.
+
+Every config in ``configs/ablations`` is trained with three seeds for the same number of items; runs
+that are there already are gone on with or just read. The figure of a run is its last evaluation, on
+the same held-out sequences for all; the interval is Student's over the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.learning_curve import history
+from benchmarks.timing import show
+
+CONFIGS = Path(__file__).parent.parent / "configs" / "ablations"
+SEEDS = (0, 1, 2)
+
+
+def train(config: Path, seed: int, folder: Path) -> Path:
+    """Train one run to its end, unless it is there; returns its folder."""
+    run = folder / f"{config.stem}_{seed}"
+    command = [sys.executable, "-m", "marl_pack.train"]
+    if (run / "latest.pt").is_file():
+        command += ["--resume", str(run)]
+    else:
+        command += ["--config", str(config), "--seed", str(seed), "--output.name", run.name,
+                    "--output.folder", str(folder)]  # fmt: skip
+    subprocess.run(command, check=True)
+    return run
+
+
+def main() -> None:
+    """Train what is missing, then print the table."""
+    options = argparse.ArgumentParser(prog="python -m benchmarks.ablations")
+    options.add_argument("names", nargs="*", help="configs in configs/ablations (default: all)")
+    options.add_argument("--folder", type=Path, default=Path("runs/ablations"))
+    chosen = options.parse_args()
+    configs = [CONFIGS / f"{n}.yaml" for n in chosen.names] or sorted(CONFIGS.glob("*.yaml"))
+    table = []
+    for config in configs:
+        last = [history(train(config, seed, chosen.folder))[-1] for seed in SEEDS]
+        u = 100 * np.array([row["utilization"] for row in last])
+        bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
+        minutes = np.mean([row["seconds"] for row in last]) / 60
+        table.append([config.stem, f"{u.mean():.2f} ± {(bounds.high - bounds.low) / 2:.2f}",
+                      " ".join(f"{value:.2f}" for value in u), f"{last[0]['items']:,.0f}",
+                      f"{minutes:.1f}"])  # fmt: skip
+    columns = ["config", "utilization %", "each seed", "items", "minutes"]
+    show(f"ablations, {len(SEEDS)} seeds", columns, table)
+
+
+if __name__ == "__main__":
+    main()
