@@ -1,6 +1,7 @@
 """How fast does the trainer learn? ``python -m benchmarks.training``.
 
-Items per second of whole PPO iterations, rollout and update, and where the time goes: environment
+Items per second of whole PPO iterations, rollout and update (the best of several, as a machine's
+disturbances only slow), and where the time goes: environment
 with masks, networks (forward, backward, optimiser), rsl_rl's own machinery (storage, minibatches,
 advantages, loss), and the rest.
 """
@@ -21,7 +22,7 @@ from marl_pack.config import parse
 from marl_pack.train import make_runner
 
 CONFIGS = Path(__file__).parent.parent / "configs"
-PARTS = ("environment", "networks", "rsl_rl", "rest")
+PARTS = ("game", "networks", "rsl_rl", "rest")
 
 OTHERS = (
     ("Zhao 2021, their trainer", "123 – 132"),
@@ -68,7 +69,7 @@ class Split:
 def watched(runner: Runner, split: Split) -> None:
     """Count the parts of a runner's iterations."""
     for name in ("step", "orient", "get_observations"):
-        split.watch(runner.env, name, "environment")
+        split.watch(runner.env, name, "game")
     for ppo in runner.alg.learners.values():
         for name in ("act", "process_env_step", "compute_returns", "update"):
             split.watch(ppo, name, "rsl_rl")
@@ -132,7 +133,7 @@ def main() -> None:
             for bins in (256, 1024) if device == "cpu" else (4096, 16384):
                 rate, shares = measure(config, device, bins, 20.0)
                 rows.append(
-                    [f"configs/{config}.yaml, N = {bins:,}", device, f"{rate:,.0f}"]
+                    [f"{config}, N = {bins:,}", device, f"{rate:,.0f}"]
                     + [f"{100 * shares[part]:.1f} %" for part in PARTS]
                 )
     rows += [[name, "cpu, told", rate, "", "", "", ""] for name, rate in OTHERS]

@@ -94,10 +94,9 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
     torch.save({"format": 1, "agents": []}, path)
     with pytest.raises(ValueError, match=r"not a checkpoint of marl_pack\.train"):
         checkpoint.read(path)
+    wrong = {"agents": {"orientation": {"network": {"c": 1}}}}
     with pytest.raises(ValueError, match="orientation agent's weights do not fit"):
-        checkpoint.load_actor(
-            {"agents": {"orientation": {"network": {"c": 1}}}}, "orientation", "cpu"
-        )
+        checkpoint.load_actor(wrong, "orientation", "cpu")
     found["agents"]["placement"]["network"]["channels"] = 16
     with pytest.raises(ValueError, match="placement agent's weights do not fit"):
         checkpoint.load_policy(found)

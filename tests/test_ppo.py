@@ -76,8 +76,9 @@ def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
 
 
 def test_advantages_are_those_worked_by_hand() -> None:
-    runner = make_runner(tiny("--ppo.gamma=0.5", "--ppo.lam=0.5", "--ppo.num_envs=1", "--ppo.num_mini_batches=1",
-                              "--ppo.num_steps_per_env=3"), None)  # fmt: skip
+    config = tiny("--ppo.gamma=0.5", "--ppo.lam=0.5", "--ppo.num_envs=1",
+                  "--ppo.num_steps_per_env=3", "--ppo.num_mini_batches=1")  # fmt: skip
+    runner = make_runner(config, None)
     for name, ppo in runner.alg.learners.items():
         storage = ppo.storage
         storage.rewards[:, 0, 0] = torch.tensor([1.0, 2.0, 3.0])
