@@ -27,9 +27,11 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
+from rich.text import Text
 
 import marl_pack
 from marl_pack import evaluate
@@ -211,41 +213,42 @@ class Display:
         self.live = console.is_terminal
         self.bar = Bar(
             TextColumn("iteration {task.completed:.0f}/{task.total:.0f}"), BarColumn(20),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-            TextColumn("{task.description}"), console=console,
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=console,
         )  # fmt: skip
+        self.text = Text()
+        self.view = Live(Group(self.bar, self.text), console=console, refresh_per_second=2)
         self.task = self.bar.add_task("", total=total, completed=done)
-        self.said, self.rate = 0.0, 0.0
+        self.said = 0.0
 
     def show(self, progress: Progress) -> None:
         """One iteration is done."""
-        text = self.line(progress)
-        self.rate = progress.items_per_second
-        self.bar.update(self.task, completed=progress.iteration, description=text)
+        lines = self.lines(progress)
+        self.bar.update(self.task, completed=progress.iteration)
+        self.text.plain = "\n".join(lines)
         now = time.monotonic()
         final = progress.iteration == self.total
         if not self.live and (final or now - self.said > QUIET_SECONDS):
             self.said = now
             left = (self.total - progress.iteration) * progress.seconds / progress.iteration
             self.console.print(
-                f"iteration {progress.iteration}/{self.total}  {text}  "
+                f"iteration {progress.iteration}/{self.total}  {'  '.join(lines)}  "
                 f"left {datetime.timedelta(seconds=round(left))}",
                 soft_wrap=True,
             )
 
     @staticmethod
-    def line(progress: Progress) -> str:
-        """Speed, utilization, reward, and each learner's entropy and KL."""
+    def lines(progress: Progress) -> list[str]:
+        """Speed, utilization and reward; then each learner's entropy and KL divergence."""
         shown = [f"{progress.items_per_second:,.0f} items/s"]
         if not math.isnan(progress.utilization):
             shown.append(f"util {100 * progress.utilization:.1f} %")
         if not math.isnan(progress.reward):
             shown.append(f"reward {progress.reward:.3f}")
-        for key, value in progress.losses.items():
-            name, _, what = key.partition("/")
-            if what in ("entropy", "kl"):
-                shown.append(f"{name[:5]} {what} {value:.3f}")
-        return "  ".join(shown)
+        learned = []
+        for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses):
+            entropy, kl = (progress.losses[f"{name}/{what}"] for what in ("entropy", "kl"))
+            learned.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
+        return ["  ".join(shown), "  ".join(learned)]
 
     def evaluated(self, row: Mapping[str, Any]) -> None:
         """An evaluation is done."""
@@ -390,7 +393,7 @@ def train(
     before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:
         if display.live and rank() == 0:
-            with display.bar:
+            with display.view:
                 runner.train(total)
         else:
             runner.train(total)
