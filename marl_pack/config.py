@@ -218,6 +218,7 @@ def make_parser() -> ArgumentParser:
         prog="python -m marl_pack.train",
         description="Train the orientation and the placement agent.",
         exit_on_error=False,
+        allow_abbrev=False,
     )
     parser.add_argument("--config", action="config", help="YAML file of settings; may be repeated")
     parser.add_argument(

@@ -36,7 +36,7 @@ from rich.text import Text
 import marl_pack
 from marl_pack import evaluate
 from marl_pack.agents import checkpoint
-from marl_pack.agents.runner import Progress, RunInterruptedError, Runner
+from marl_pack.agents.runner import Progress, RunInterruptedError, Runner, TrainingDivergedError
 from marl_pack.config import Agent, Config, ConfigError, from_dict, parse
 from marl_pack.files import write_atomically
 from marl_pack.items import Stream, choose_stream
@@ -252,11 +252,11 @@ class Display:
 
     def evaluated(self, row: Mapping[str, Any]) -> None:
         """An evaluation is done."""
-        half = (row["high"] - row["low"]) / 2
+        spread = "" if row["low"] is None else f" ± {50 * (row['high'] - row['low']):.2f}"
         self.console.print(
             f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "
-            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f} "
-            f"± {100 * half:.2f} % over {row['episodes']} episodes",
+            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f}{spread} "
+            f"% over {row['episodes']} episodes",
             soft_wrap=True,
         )
 
@@ -428,6 +428,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         console.print("stopped at once; the last checkpoint is as it was")
         return 130
+    except TrainingDivergedError as error:
+        print(f"python -m marl_pack.train: {error}", file=sys.stderr)
+        return 1
     except (ConfigError, FileNotFoundError, ModuleNotFoundError) as error:
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 2

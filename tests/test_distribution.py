@@ -96,3 +96,12 @@ def test_the_best_action_is_legal() -> None:
     d = MaskedCategorical()
     d.mask = torch.tensor([[False, True, True]])
     assert d.deterministic_output(torch.tensor([[9.0, -5.0, -4.0]])).item() == 2
+
+
+def test_no_finite_logit_passes_the_mask() -> None:
+    d = MaskedCategorical()
+    d.mask = torch.tensor([[False, True]])
+    logits = torch.tensor([[3e9, -7e9]])
+    assert d.deterministic_output(logits).item() == 1
+    d.update(logits)
+    assert d.sample().item() == 1

@@ -168,6 +168,28 @@ def test_weights_and_biases_get_the_settings_and_the_scalars(
     assert main([*options, f"--output.folder={tmp_path / 'without'}"]) == 2
 
 
+def test_a_run_that_diverges_says_so_and_keeps_its_last_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wild = ["--ppo.learning_rate=1e30", "--ppo.max_iterations=9", "--evaluation.every=0"]
+    assert main([*SMALL, *wild, f"--output.folder={tmp_path}"]) == 1
+    assert "training diverged in iteration" in capsys.readouterr().err
+
+
+def test_a_file_of_one_sequence_is_trained_on_and_options_are_not_abbreviated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = tmp_path / "one.json"
+    items.write_text(json.dumps({"bin": [5, 5, 5], "items": [[2, 2, 2]] * 6}))
+    options = [*SMALL, f"--game.items={items}", "--ppo.max_iterations=2"]
+    assert main([*options, f"--output.folder={tmp_path}"]) == 0
+    assert "over 1 episodes" in capsys.readouterr().out
+    assert main(["--ppo.learning_rat=3"]) == 2
+    assert "unknown key ppo.learning_rat. Did you mean ppo.learning_rate?" in (
+        capsys.readouterr().err
+    )
+
+
 def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

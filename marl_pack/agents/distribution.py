@@ -9,6 +9,9 @@ from torch import Tensor, nn
 FORBIDDEN = -1e9
 """Logit of an illegal action. Finite, so that entropy and KL are; its probability is exactly 0."""
 
+LARGEST = 1e8
+"""Logits are kept within ± this, well above :data:`FORBIDDEN`."""
+
 
 class MaskedCategorical(Distribution):
     """Categorical over K actions of which only the masked ones can be drawn.
@@ -33,7 +36,7 @@ class MaskedCategorical(Distribution):
 
     def masked(self, logits: Tensor) -> Tensor:
         """The logits [B, K] with illegal ones at :data:`FORBIDDEN`, float32."""
-        logits = logits.float()
+        logits = logits.float().clamp(-LARGEST, LARGEST)  # else a huge one could pass the mask
         return logits if self.mask is None else torch.where(self.mask, logits, FORBIDDEN)
 
     def update(self, mlp_output: Tensor) -> None:

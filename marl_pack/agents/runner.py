@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -33,6 +34,10 @@ LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
 
 class RunInterruptedError(Exception):
     """The run was asked to stop, and has, at the end of an iteration, with a checkpoint."""
+
+
+class TrainingDivergedError(Exception):
+    """Losses are no numbers any more; the last checkpoint is as it was."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +150,12 @@ class Runner(OnPolicyRunner):
         """Evaluate, checkpoint and stop where it is time to."""
         self.current_learning_iteration = it = progress.iteration - 1
         self.show(progress)
+        wrong = [key for key, value in progress.losses.items() if not math.isfinite(value)]
+        if wrong:
+            raise TrainingDivergedError(
+                f"training diverged in iteration {progress.iteration}: {', '.join(wrong)} not "
+                "finite; the last checkpoint is as it was; try a smaller learning rate"
+            )
         final = it == self.last_iteration
         stop = self._any_process(self.stop_requested)
         if self.folder is None:
