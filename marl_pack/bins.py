@@ -145,6 +145,23 @@ def clear(bins: Bins, which: Tensor | slice) -> None:
         tensor[which] = 0
 
 
+def check_device(device: torch.device | str) -> torch.device:
+    """Return ``device`` as torch's.
+
+    Raises:
+        ValueError: unless it is the CPU or a CUDA device that is there.
+    """
+    try:
+        found = torch.device(device)
+        if found.type not in ("cpu", "cuda"):
+            raise ValueError("needs cpu, cuda or cuda:N")
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, ValueError) as error:
+        first = str(error).strip().splitlines()[0]
+        raise ValueError(f"device {str(device)!r}: {first}") from None
+    return found
+
+
 def compiled(device: torch.device) -> bool:
     """Whether tensors on ``device`` are handed to compiled loops; elsewhere tensor code does it.
 

@@ -10,10 +10,14 @@ import contextlib
 import difflib
 import math
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
+import yaml
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
 from marl_pack.agents.trunk import Network
@@ -242,10 +246,50 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
     Raises:
         ConfigError: for an unknown key, a wrong type or an impossible value.
     """
+    given = sys.argv[1:] if arguments is None else arguments
+    for before, option in pairwise(("", *given)):
+        path = option if before == "--config" else option.removeprefix("--config=")
+        if "\n" in path:  # settings themselves, not a file's name
+            continue
+        if (before == "--config" or path != option) and Path(path).is_file():
+            check_file(Path(path))
     parser = make_parser()
     with _explained(parser):
-        options = parser.parse_args(arguments)
+        options = parser.parse_args(given)
         return build(parser, options), options
+
+
+def check_file(path: Path) -> None:
+    """Refuse what the parser would take silently, or not say where it stands.
+
+    Raises:
+        ConfigError: for a file that is no YAML mapping, or has a key twice or an empty section.
+    """
+    try:
+        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text in UTF-8 ({error.reason})") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(root, yaml.MappingNode):
+        raise ConfigError(f"{path}: needs keys and values, as configs/rs.yaml has them")
+    sections = {key.rpartition(".")[0] for key in keys(make_parser())} - {""}
+
+    def look(node: yaml.MappingNode, prefix: str) -> None:
+        seen = set()
+        for name, value in node.value:
+            key, where = f"{prefix}{name.value}", f"{path}, line {name.start_mark.line + 1}"
+            if key in seen:
+                raise ConfigError(f"{where}: {key} stands there twice")
+            if key == "resume":
+                raise ConfigError(f"{where}: --resume goes on the command line")
+            seen.add(key)
+            if isinstance(value, yaml.MappingNode):
+                look(value, f"{key}.")
+            elif key in sections:
+                raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
+
+    look(root, "")
 
 
 def build(parser: ArgumentParser, options: Namespace) -> Config:
@@ -352,6 +396,9 @@ def check(config: Config) -> None:
                 refuse(section, value, "coefficients and rates need finite numbers, 0 or more")
     if config.threads < 1:
         refuse("threads", config.threads, "needs 1 or more")
+    for key, value in (("seed", config.seed), ("evaluation.seed", evaluation.seed)):
+        if value < 0:
+            refuse(key, value, "needs 0 or more")
     if evaluation.every < 0:
         refuse("evaluation.every", evaluation.every, "needs 0 (never) or more")
     if evaluation.episodes < 2:
@@ -359,7 +406,7 @@ def check(config: Config) -> None:
     for key in ("latest_every", "keep_every"):
         if getattr(output, key) < 1:
             refuse(f"output.{key}", getattr(output, key), "needs 1 or more")
-    if output.name is not None and (not output.name or "/" in output.name):
+    if output.name in ("", ".", "..") or (output.name is not None and "/" in output.name):
         refuse("output.name", repr(output.name), "needs the name of one folder")
     for name, agent in (("orientation", config.orientation), ("placement", config.placement)):
         if agent.frozen and agent.policy is None:

@@ -27,14 +27,23 @@ from scipy import stats
 
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
 from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.bins import check_device
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.stability import RULES, in_equilibrium
+from marl_pack.stability.candidates import NO_OFFSET
 
 BATCH = 1024  # bins played at once, at most
 BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
 EPISODES = 1000  # of a generated stream, unless told
+DEFAULTS: dict[str, Any] = {
+    "items": "rs", "bin": None, "sides": DEFAULT_SIDES, "rule": "hull_alpha", "margin": None,
+    "thresholds": None, "orientations": list(ALL_ORIENTATIONS), "mask_orientations": True,
+    "com_offset": NO_OFFSET,
+}  # fmt: skip
+"""The game's options where neither the command line nor a checkpoint says; ``bin`` None is the
+file's own or 10 x 10 x 10."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +130,9 @@ def mean_utilization(played: Episodes) -> dict[str, Any]:
     """
     u = played.utilization
     low = high = std = None
-    if len(u) > 1:
+    if len(u) > 1 and np.ptp(u) == 0:
+        low, high, std = float(u[0]), float(u[0]), 0.0
+    elif len(u) > 1:
         bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
         low, high, std = float(bounds.low), float(bounds.high), float(u.std(ddof=1))
     return {
@@ -216,7 +227,8 @@ def parser() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(
         prog="python -m marl_pack.evaluate",
         description=__doc__.split("\n\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        epilog="The game is the one that the first checkpoint among the policies was trained on, "
+        "else RS in a bin of 10 x 10 x 10 under hull_alpha; each option changes that.",
     )
     add = options.add_argument
     add("--policy", nargs="+", metavar="NAME",
@@ -228,29 +240,37 @@ def parser() -> argparse.ArgumentParser:
     add("--placement", metavar="NAME",
         help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a run's "
              "folder or a checkpoint")  # fmt: skip
-    add("--items", default="rs", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
+    add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
-        help="bin size in cells (default: the file's own, else 10 10 10)")  # fmt: skip
-    add("--sides", nargs=2, type=int, default=DEFAULT_SIDES, metavar=("SHORTEST", "LONGEST"),
+        help="bin size in cells; a file brings its own")  # fmt: skip
+    add("--sides", nargs=2, type=int, metavar=("SHORTEST", "LONGEST"),
         help="sides of generated items, in cells")  # fmt: skip
-    add("--rule", default="hull_alpha", choices=list(RULES), help="stability rule of the masks")
+    add("--rule", choices=list(RULES), help="stability rule of the masks")
     add("--margin", type=float, help="cells by which the support polygon is shrunk")
     add("--thresholds", choices=["paper", "code"], help="of the rule area_ratio")
-    add("--orientations", nargs="+", type=int, default=list(ALL_ORIENTATIONS), metavar="O",
+    add("--orientations", nargs="+", type=int, metavar="O",
         help="orientations that may be chosen, of 0 … 5")  # fmt: skip
-    add("--no-orientation-mask", action="store_true",
-        help="let orientations without a legal cell be chosen; that ends the episode")  # fmt: skip
+    add("--orientation-mask", action=argparse.BooleanOptionalAction, dest="mask_orientations",
+        help="whether orientations without a legal cell are excluded; else choosing one ends the "
+             "episode")  # fmt: skip
+    add("--com-offset", nargs=3, type=float, metavar=("X", "Y", "Z"),
+        help="centre of mass of the items from their middle, in fractions of w, d, h")  # fmt: skip
     add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
-    add("--seed", type=int, default=0, help="of generated items and of random play")
-    add("--device", default="cpu", help="cpu, cuda, cuda:1, …")
-    add("--threads", type=int, default=1, help="of torch on the CPU")
+    add("--seed", type=int, default=0, help="of generated items and of random play (default: 0)")
+    add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
+    add("--threads", type=int, default=1, help="of torch on the CPU (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there")
     add("--save-stacks", type=Path, metavar="FILE", help="write the packed boxes there (.npz)")
     return options
 
 
-def choose_policies(arguments: argparse.Namespace, console: Console) -> dict[str, Policy]:
-    """The policies that the options name, by the name of their row.
+def choose_policies(
+    arguments: argparse.Namespace, console: Console
+) -> tuple[dict[str, Policy], dict[str, Any]]:
+    """The policies that the options name, by the name of their row, and the game they are for.
+
+    The game is that of the first checkpoint among them (the keys of
+    :class:`marl_pack.config.Game`), empty if there is none.
 
     Raises:
         ValueError, FileNotFoundError: if there is none of that name.
@@ -260,7 +280,7 @@ def choose_policies(arguments: argparse.Namespace, console: Console) -> dict[str
         raise ValueError("--orientation and --placement go together: name both agents")
     names = arguments.policy or ([] if pair[0] else ["dblf"])
     if all(name in POLICIES for name in names) and pair == (None, None):
-        return {n: make_policy(n, arguments.seed, arguments.device) for n in names}
+        return {n: make_policy(n, arguments.seed, arguments.device) for n in names}, {}
     # Only learned agents need rsl_rl.
     from marl_pack.agents import checkpoint
 
@@ -271,11 +291,30 @@ def choose_policies(arguments: argparse.Namespace, console: Console) -> dict[str
             checkpoint.find_orientation_agent(pair[0], *where),
             checkpoint.find_placement_agent(pair[1], *where),
         )
+    learned: dict[str, Any] = {}
     for source in dict.fromkeys((*names, *pair)):
         if source is not None and source not in ORIENTATION_AGENTS:
-            trained = checkpoint.trained_on(source)
-            console.print(f"{source}: trained on {trained}", soft_wrap=True)
-    return policies
+            found = checkpoint.read(source)
+            learned = learned or found["config"]["game"]
+            console.print(f"{source}: trained on {checkpoint.trained_on(found)}", soft_wrap=True)
+    return policies, learned
+
+
+def choose_game(arguments: argparse.Namespace, learned: dict[str, Any]) -> None:
+    """Fill the options on the game that were not given.
+
+    Args:
+        arguments: the options, changed in place.
+        learned: the game that the policies were trained on, empty if there is none.
+    """
+    settings = DEFAULTS | learned
+    if arguments.rule is not None:  # these belong to the rule
+        settings |= {"margin": None, "thresholds": None}
+    if arguments.items is not None and arguments.items not in GENERATED:
+        settings["bin"] = None
+    for key in DEFAULTS:
+        if getattr(arguments, key) is None:
+            setattr(arguments, key, settings[key])
 
 
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
@@ -284,11 +323,11 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     Raises:
         ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
     """
-    try:
-        torch.empty(0, device=arguments.device)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {arguments.device}: {error}") from None
-    policies = choose_policies(arguments, console)
+    check_device(arguments.device)
+    if arguments.seed < 0:
+        raise ValueError(f"--seed {arguments.seed}: needs 0 or more")
+    policies, learned = choose_policies(arguments, console)
+    choose_game(arguments, learned)
     if arguments.save_stacks and len(policies) > 1:
         raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
     for path in (arguments.json, arguments.save_stacks):
@@ -310,7 +349,8 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         return Packing(
             n, size, stream, rule=arguments.rule, rule_parameters=parameters,
             orientations=arguments.orientations,
-            mask_orientations=not arguments.no_orientation_mask, device=arguments.device,
+            mask_orientations=arguments.mask_orientations,
+            com_offset=tuple(arguments.com_offset), device=arguments.device,
             seed=arguments.seed, first_episode=first_episode, auto_reset=False,
         )  # fmt: skip
 
@@ -339,8 +379,10 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         title += f" ({', '.join(f'{k} {v}' for k, v in parameters.items())})"
     if set(arguments.orientations) != set(ALL_ORIENTATIONS):
         title += f", orientations {sorted(set(arguments.orientations))}"
-    if arguments.no_orientation_mask:
+    if not arguments.mask_orientations:
         title += ", no mask of orientations"
+    if any(arguments.com_offset):
+        title += f", centre of mass off by {' '.join(f'{o:g}' for o in arguments.com_offset)}"
     show(rows, title, console)
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
@@ -357,7 +399,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError) as error:
         options.exit(2, f"{options.prog}: {error}\n")
     return 0
 

@@ -10,6 +10,7 @@ the bin itself into items, so that a perfect packing is known (:func:`cut`).
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -304,6 +305,15 @@ class Cut:
     def to(self, device: torch.device | str) -> Cut:
         """Itself: the cuts are made on the CPU and handed over episode by episode."""
         return self
+
+
+def fingerprint(stream: Stream) -> int:
+    """A number that differs between streams of different items, the same in every process."""
+    digest = hashlib.blake2b(type(stream).__name__.encode(), digest_size=7)
+    for value in getattr(stream, "__dict__", {}).values():
+        held = value.cpu().numpy().tobytes() if isinstance(value, Tensor) else repr(value).encode()
+        digest.update(held)
+    return int.from_bytes(digest.digest(), "little")
 
 
 def _row(table: Tensor, t: Tensor) -> Tensor:

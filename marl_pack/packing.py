@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from marl_pack import bins as state
-from marl_pack.bins import ORIENTATIONS, check_size
-from marl_pack.items import DEFAULT_SIDES, Stream, make_stream
+from marl_pack.bins import ORIENTATIONS, check_device, check_size
+from marl_pack.items import DEFAULT_SIDES, Stream, fingerprint, make_stream
 from marl_pack.stability import Candidates, Rule, candidates, make_rule
 from marl_pack.stability.candidates import NO_OFFSET, check_com_offset
 
@@ -130,7 +130,7 @@ class Packing:
             raise ValueError(f"orientations {orientations!r}: need one or more of 0 … 5")
         self.n = n
         self.size = check_size(size)
-        self.device = torch.device(device)
+        self.device = check_device(device)
         self.stream = make_stream(items, self.size, sides).to(self.device)
         if isinstance(rule, str):
             rule = make_rule(rule, **(rule_parameters or {}))
@@ -247,6 +247,7 @@ class Packing:
         """Everything that the rest of the game depends on, to be kept and loaded again."""
         tensors = dict(zip(BIN_FIELDS, self.bins.tensors(), strict=True))
         tensors |= {name: getattr(self, name) for name in GAME_FIELDS}
+        tensors["stream"] = torch.tensor(fingerprint(self.stream))
         return {name: tensor.clone() for name, tensor in tensors.items()}
 
     def load_state_dict(self, kept: Mapping[str, Tensor]) -> None:
@@ -262,6 +263,10 @@ class Packing:
                 raise ValueError(
                     f"state of another game: {name} is {found}, needs {list(tensor.shape)}"
                 )
+        if kept["stream"].cpu() != own["stream"]:
+            raise ValueError(
+                "state of another game: its items are not this game's; a changed file?"
+            )
         for name, tensor in zip(BIN_FIELDS, self.bins.tensors(), strict=True):
             tensor.copy_(kept[name])
         for name in GAME_FIELDS:

@@ -8,6 +8,7 @@ resolved settings, checkpoints, TensorBoard's logs and the history of evaluation
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import datetime
 import io
@@ -37,6 +38,7 @@ import marl_pack
 from marl_pack import evaluate
 from marl_pack.agents import checkpoint
 from marl_pack.agents.runner import Progress, RunInterruptedError, Runner, TrainingDivergedError
+from marl_pack.bins import check_device
 from marl_pack.config import Agent, Config, ConfigError, from_dict, parse
 from marl_pack.files import write_atomically
 from marl_pack.items import Stream, choose_stream
@@ -161,9 +163,9 @@ def make_runner(
     """
     device = local_device(config)
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device = {config.device}: {error}") from None
+        check_device(device)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
     torch.manual_seed(config.seed)
     try:
         settings = runner_settings(config, found)
@@ -202,7 +204,8 @@ def evaluation(config: Config, found: Mapping[str, Any]) -> dict[str, Any]:
 
     stream = make_stream(config)
     episodes = min(config.evaluation.episodes, stream.episodes or config.evaluation.episodes)
-    return evaluate.mean_utilization(evaluate.play(policy, game, episodes))
+    reached = evaluate.mean_utilization(evaluate.play(policy, game, episodes))
+    return {"seed": config.evaluation.seed, **reached}
 
 
 class Display:
@@ -264,7 +267,7 @@ class Display:
 def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
     """Write the evaluations as CSV."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(history[0]))
+    writer = csv.DictWriter(text, list(history[-1]))
     writer.writeheader()
     writer.writerows(history)
     write_atomically(path, lambda file: file.write(text.getvalue().encode()))
@@ -293,10 +296,10 @@ def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None
 
 
 def new_folder(config: Config) -> Path:
-    """The folder of a new run.
+    """The folder of a new run, made here: no two runs share one.
 
     Raises:
-        ConfigError: if there is a run in it.
+        ConfigError: if there is something in it, or it cannot be made.
     """
     name = config.output.name
     if name is None:
@@ -306,6 +309,12 @@ def new_folder(config: Config) -> Path:
         raise ConfigError(
             f"output.name: {folder} holds a run; --resume {folder} goes on with it; or name another"
         )
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise ConfigError(f"output.name: {folder} is there already; name another") from None
+    except OSError as error:
+        raise ConfigError(f"output.folder: {error}") from None
     return folder
 
 
@@ -331,6 +340,11 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
                 f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
                 "output.*, evaluation.* and ppo.max_iterations may change"
             )
+    done = found["iter"] + 1
+    if config.ppo.max_iterations < min(done, kept.ppo.max_iterations):
+        raise ConfigError(
+            f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
+        )
     return config, found
 
 
@@ -355,7 +369,7 @@ def train(
 
     Args:
         config: the settings.
-        folder: the run's, made if need be.
+        folder: the run's.
         console: where progress goes.
         found: the checkpoint to go on from.
 
@@ -380,7 +394,6 @@ def train(
         evaluated=evaluated,
     )
     if rank() == 0:
-        folder.mkdir(parents=True, exist_ok=True)
         write_record(folder, config, sys.argv[1:])
 
     def stop(number: int, frame: object) -> None:
@@ -409,6 +422,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command ``python -m marl_pack.train``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     console = Console()
+    run, folder = None, None
     try:
         run, rest = _resume_option(given)
         found = None
@@ -417,7 +431,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             folder = Path(run) if Path(run).is_dir() else Path(run).parent
         else:
             config, _ = parse(given)
-            folder = new_folder(config)
+            folder = new_folder(config) if rank() == 0 else Path(config.output.folder)
+        if rank() == 0:
+            console.print(f"run: {folder}", soft_wrap=True)
         runner = train(config, folder, console if rank() == 0 else Console(quiet=True), found)
     except RunInterruptedError:
         if rank() == 0:
@@ -431,7 +447,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TrainingDivergedError as error:
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 1
-    except (ConfigError, FileNotFoundError, ModuleNotFoundError) as error:
+    except (ConfigError, OSError, ModuleNotFoundError) as error:
+        if run is None and rank() == 0 and folder is not None:
+            with contextlib.suppress(OSError):  # nothing has begun, unless something is in it
+                folder.rmdir()
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 2
     if rank() == 0:

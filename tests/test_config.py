@@ -101,6 +101,8 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
     (["--joint=true", "--game.mask_orientations=false"], r"mask_orientations.*always masked"),
     (["--ppo=null"], r"ppo"),
+    (["--seed=-1"], r"seed = -1: needs 0 or more"),
+    (["--output.name=.."], r"output\.name"),
 ])  # fmt: skip
 def test_a_mistake_is_named_with_what_would_be_right(options: list[str], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
@@ -118,8 +120,30 @@ def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "unknown key pppo.gamma" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("text", "told"), [
+    (b"", "needs keys and values"),
+    (b"- 1", "needs keys and values"),
+    (b"seed: [1", "not YAML"),
+    (b"name: \xff", "not a text in UTF-8"),
+    (b"ppo:\n  gamma: 0.9\n  lam: 0.9\n  gamma: 0.8\n", "line 4: ppo.gamma stands there twice"),
+    (b"ppo:\n", "line 1: ppo is a section"),
+    (b"placement:\n  network: 3\n", "line 2: placement.network is a section"),
+    (b"resume: runs/x\n", "line 1: --resume goes on the command line"),
+])  # fmt: skip
+def test_a_broken_file_is_named_with_the_line(
+    text: bytes, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "broken.yaml"
+    path.write_bytes(text)
+    for options in ([f"--config={path}"], ["--config", str(path)]):
+        assert main(options) == 2
+        message = capsys.readouterr().err
+        assert str(path) in message
+        assert told in message
+
+
 @pytest.mark.parametrize(("options", "told"), [
-    (["--device=abacus"], "device = abacus"),
+    (["--device=abacus"], "device 'abacus'"),
     (["--game.items=rs", "--game.bin=[4,4,4]"], "game.items: items 'rs' with sides 2..5"),
     (["--game.items=nowhere.npz"], "nowhere.npz"),
     (["--game.orientations=[7]"], "orientations"),

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marl_pack import evaluate
+from marl_pack import evaluate, train
 from marl_pack import play as play_command
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.evaluate import Episodes, load_stacks, strict_equilibrium, summary
@@ -80,6 +80,16 @@ def test_the_summary_is_as_worked_by_hand() -> None:
     assert figures["strict_equilibrium"] == pytest.approx(2 / 3)
 
 
+def test_equal_episodes_have_an_interval_of_no_width() -> None:
+    played = Episodes(
+        (9, 9, 9), np.full(3, 0.3), np.full(3, 2), np.zeros((3, 2, 6), np.int16),
+        np.zeros((3, 2, 3)), 1.0,
+    )  # fmt: skip
+    figures = summary(played, np.ones(3, np.bool_))
+    assert figures["interval"] == [0.3, 0.3]
+    assert figures["std"] == 0
+
+
 def test_a_stack_that_falls_is_counted() -> None:
     boxes = np.zeros((2, 2, 6), np.int16)
     boxes[0] = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 4, 2, 1)]  # balanced on the edge
@@ -125,7 +135,9 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--json nowhere/out.json", "does not exist"),
         ("--policy dblf random --save-stacks s.npz", "one policy"),
         ("--json tests", "is a folder"),
-        ("--device nowhere", "--device nowhere"),
+        ("--device nowhere", "device 'nowhere'"),
+        ("--device meta", "needs cpu, cuda"),
+        ("--seed -1", "needs 0 or more"),
     ],
 )
 def test_what_cannot_be_is_refused_without_a_traceback(
@@ -162,6 +174,36 @@ def test_a_single_episode_has_no_interval(tmp_path: Path) -> None:
 def test_episodes_that_cannot_begin_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate.main(["--margin", "1", "--episodes", "40"]) == 0
     assert "may be set down nowhere" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_checkpoints_own_game_is_played_unless_told_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--ppo.max_iterations=1", "--ppo.num_envs=8", "--ppo.num_mini_batches=2",
+               "--game.bin=[6,6,7]", "--game.sides=[1,3]", "--game.rule=area_ratio",
+               "--game.thresholds=code", "--game.orientations=[0,1]", "--evaluation.every=0",
+               "--game.com_offset=[0.05,0,0]", "--output.name=run"]  # fmt: skip
+    assert train.main([*options, f"--output.folder={tmp_path}"]) == 0
+    run, out = str(tmp_path / "run"), tmp_path / "out.json"
+    given = ["--policy", run, "random", "--episodes", "4", "--json", str(out)]
+
+    def settings(*more: str) -> dict[str, object]:
+        assert evaluate.main([*given, *more]) == 0
+        report: dict[str, object] = json.loads(out.read_text())["settings"]
+        return report
+
+    own = settings()
+    assert own["bin"] == [6, 6, 7]
+    assert own["sides"] == [1, 3]
+    assert own["rule"] == "area_ratio"
+    assert own["thresholds"] == "code"
+    assert own["orientations"] == [0, 1]
+    assert own["com_offset"] == [0.05, 0, 0]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "rule area_ratio (thresholds code), orientations 0 1, centre of mass off by" in told
+    other = settings("--rule", "hull_alpha", "--bin", "8", "8", "8", "--items", "cut2")
+    assert (other["rule"], other["thresholds"]) == ("hull_alpha", None)
+    assert (other["bin"], other["sides"], other["items"]) == ([8, 8, 8], [1, 3], "cut2")
 
 
 def test_a_foreign_file_of_stacks_is_refused(tmp_path: Path) -> None:

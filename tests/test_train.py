@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.agents import checkpoint
+from marl_pack.agents.runner import Runner
 from marl_pack.train import main
 
 SMALL = (
@@ -133,6 +134,8 @@ def test_a_run_may_be_made_longer_but_not_another(
     assert main(["--resume", run, "--game.bin=[6,6,6]"]) == 2
     told = capsys.readouterr().err
     assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in told
+    assert main(["--resume", run, "--ppo.max_iterations=1"]) == 2
+    assert "has done 2 already" in capsys.readouterr().err
     assert main(["--resume", run, "--ppo.max_iterations=3"]) == 0
     assert checkpoint.read(Path(run) / "latest.pt")["iter"] == 2
     assert main(["--resume", run, "--config=configs/rs.yaml"]) == 2
@@ -188,6 +191,75 @@ def test_a_file_of_one_sequence_is_trained_on_and_options_are_not_abbreviated(
     assert "unknown key ppo.learning_rat. Did you mean ppo.learning_rate?" in (
         capsys.readouterr().err
     )
+
+
+def test_a_run_takes_over_no_folder_and_leaves_none_behind_that_it_did_not_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    assert main([*SMALL, f"--output.folder={tmp_path}"]) == 2
+    assert "is there already" in capsys.readouterr().err
+    other = [*SMALL, f"--output.folder={tmp_path}", "--output.name=other"]
+    assert main([*other, "--placement.frozen=true", "--placement.policy=nobody"]) == 2
+    assert main([*other, "--device=meta"]) == 2
+    assert "device 'meta': needs cpu, cuda or cuda:N" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["notes.txt", "run"]
+    (tmp_path / "file").write_text("")
+    assert main([*SMALL, f"--output.folder={tmp_path / 'file'}"]) == 2
+
+
+def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:
+    """A checkpoint is there before the first iteration, and on resuming holds what is new."""
+    begun: list[int] = []
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(self: Runner, iterations: int, **named: object) -> None:
+        begun.append(iterations)
+        raise StoppedError
+
+    whole = [*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path / 'whole'}"]
+    assert main(whole) == 0
+    options = [*SMALL, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]
+    run = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runner, "learn", stop)
+        with pytest.raises(StoppedError):
+            main(options)
+        with pytest.raises(StoppedError):
+            main(["--resume", str(run), "--ppo.max_iterations=2"])
+    assert begun == [1, 2]
+    assert checkpoint.read(run / "latest.pt")["iter"] == -1
+    assert main(["--resume", str(run)]) == 0
+    assert same(networks(run), networks(tmp_path / "whole" / "run"))
+
+
+def test_evaluations_on_other_sequences_are_not_compared(tmp_path: Path) -> None:
+    assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
+    run = tmp_path / "run"
+    found = checkpoint.read(run / "latest.pt")
+    found["evaluations"][0]["utilization"] = 2.0  # better than any other can be
+    checkpoint.write(run / "latest.pt", found)
+    assert main(["--resume", str(run), "--ppo.max_iterations=4"]) == 0
+    assert checkpoint.read(run / "best.pt")["iter"] == 1
+    more = ["--resume", str(run), "--ppo.max_iterations=6", "--evaluation.seed=7"]
+    assert main(more) == 0
+    assert checkpoint.read(run / "best.pt")["iter"] == 5
+
+
+def test_a_changed_file_of_items_is_not_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = tmp_path / "items.json"
+    for edge in (2, 3):
+        items.write_text(json.dumps({"bin": [5, 5, 5], "items": [[edge, 2, 2]] * 6}))
+        if edge == 2:
+            options = [*SMALL, f"--game.items={items}", "--ppo.max_iterations=2"]
+            assert main([*options, f"--output.folder={tmp_path}"]) == 0
+    assert main(["--resume", str(tmp_path / "run"), "--ppo.max_iterations=3"]) == 2
+    assert "a changed file?" in capsys.readouterr().err
 
 
 def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Path) -> None:

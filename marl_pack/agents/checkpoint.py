@@ -37,6 +37,7 @@ from marl_pack.agents.policy import (
     Policy,
     in_turns,
 )
+from marl_pack.bins import ORIENTATIONS
 from marl_pack.files import write_atomically
 from marl_pack.packing import Packing
 
@@ -74,6 +75,7 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
         ValueError: if the file is truncated, of another program or of a newer format.
     """
     path = resolve(source)
+    path.open("rb").close()  # where it may not be read, that is what to say
     if not zipfile.is_zipfile(path):
         raise ValueError(
             f"{path}: not a checkpoint, or cut short ({path.stat().st_size:,} bytes); "
@@ -221,14 +223,28 @@ def find_placement_agent(
     return placement_agent(read(_path(source, POLICIES), device), device, seed)
 
 
-def trained_on(source: str) -> str:
-    """The game that a checkpoint's agents learned, and how long, in words."""
-    found = read(_path(source, ORIENTATION_AGENTS))
+def trained_on(found: Mapping[str, Any]) -> str:
+    """The game that a checkpoint's agents learned, and how long, in words.
+
+    Args:
+        found: what :func:`read` gave.
+    """
     game = found["config"]["game"]
     size = " x ".join(map(str, game["bin"]))
     sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
+    rule = game["rule"]
+    if game["margin"] is not None:
+        rule += f" (margin {game['margin']:g})"
+    if game["thresholds"] is not None:
+        rule += f" (thresholds {game['thresholds']})"
+    if len(game["orientations"]) < len(ORIENTATIONS):
+        rule += f", orientations {' '.join(map(str, game['orientations']))}"
+    if not game["mask_orientations"]:
+        rule += ", no mask of orientations"
+    if any(game["com_offset"]):
+        rule += f", centre of mass off by {' '.join(f'{o:g}' for o in game['com_offset'])}"
     return (
-        f"{game['items']}{sides}, bin {size}, rule {game['rule']}, "
+        f"{game['items']}{sides}, bin {size}, rule {rule}, "
         f"{found['items']:,} items, seed {found['config']['seed']}"
     )
 

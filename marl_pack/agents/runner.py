@@ -28,6 +28,7 @@ from marl_pack.agents.policy import Policy
 from marl_pack.agents.ppo import PackingPPO
 from marl_pack.vec_env import PackingVecEnv
 
+COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
 LOGGER_STATE = ("tot_timesteps", "tot_time", "cur_reward_sum", "cur_episode_length")
 LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
 
@@ -60,8 +61,11 @@ class IterationLogger(Logger):
 
     def init_logging_writer(self) -> None:
         """Open the writer, and keep the state of the code beside its logs."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().init_logging_writer()
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                super().init_logging_writer()
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(f"{error} (pip install 'marl_pack[wandb]')") from None
 
     def log(
         self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float,
@@ -142,6 +146,9 @@ class Runner(OnPolicyRunner):
         """
         self.last_iteration = iterations - 1
         remaining = iterations - self.current_learning_iteration
+        self.current_learning_iteration -= 1  # the one last done
+        self._write_latest()  # from now on the run can be gone on with, with its settings
+        self.current_learning_iteration += 1
         if remaining > 0:
             self.learn(remaining)
             self.current_learning_iteration += 1  # rsl_rl would repeat the last one
@@ -157,22 +164,22 @@ class Runner(OnPolicyRunner):
                 "finite; the last checkpoint is as it was; try a smaller learning rate"
             )
         final = it == self.last_iteration
-        stop = self._any_process(self.stop_requested)
-        if self.folder is None:
-            if stop:
-                raise RunInterruptedError
-            return
-        every = self.cfg["evaluate_every"]
+        every = self.cfg["evaluate_every"] if self.folder is not None else 0
         if self.evaluate is not None and every and (final or progress.iteration % every == 0):
             self._evaluate(progress)
+        stop = self._any_process(self.stop_requested)
         if stop or final or progress.iteration % self.cfg["latest_every"] == 0:
-            state = self._gather(self.state())  # every process takes part
-            if self.gpu_global_rank == 0:
-                checkpoint.write(
-                    self.folder / checkpoint.LATEST, self.checkpoint() | {"state": state}
-                )
+            self._write_latest()
         if stop and not final:
             raise RunInterruptedError
+
+    def _write_latest(self) -> None:
+        """Write the checkpoint to resume from; every process takes part."""
+        if self.folder is None:
+            return
+        state = self._gather(self.state())
+        if self.gpu_global_rank == 0:
+            checkpoint.write(self.folder / checkpoint.LATEST, self.checkpoint() | {"state": state})
 
     def _evaluate(self, progress: Progress) -> None:
         """Add a row to the history; keep the checkpoint if it is the best so far."""
@@ -187,7 +194,8 @@ class Runner(OnPolicyRunner):
             **found,
             "evaluation_seconds": time.perf_counter() - start,
         }
-        best = max((r["utilization"] for r in self.evaluations), default=float("-inf"))
+        same = [r for r in self.evaluations if all(r.get(k) == row.get(k) for k in COMPARABLE)]
+        best = max((r["utilization"] for r in same), default=float("-inf"))
         self.evaluations.append(row)
         if self.logger.writer is not None:
             self.logger.writer.add_scalar(
@@ -266,7 +274,10 @@ class Runner(OnPolicyRunner):
             raise ValueError(
                 f"the run had {len(states)} processes, this one has {self.gpu_world_size}"
             )
-        self.alg.load(dict(found) | {"learners": found["agents"]}, None, True)
+        try:
+            self.alg.load(dict(found) | {"learners": found["agents"]}, None, True)
+        except (RuntimeError, KeyError, TypeError) as error:
+            raise ValueError(f"the checkpoint does not fit its own settings: {error}") from None
         self.current_learning_iteration = found["iter"] + 1
         self.evaluations = list(found["evaluations"])
         own = states[self.gpu_global_rank]
