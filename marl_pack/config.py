@@ -48,7 +48,9 @@ class Game:
     bin: tuple[int, int, int] = (10, 10, 10)
     items: str = "rs"
     sides: tuple[int, int] = DEFAULT_SIDES
-    rule: Literal["hull_1", "hull_alpha", "area_ratio", "lbcp", "equilibrium"] = "hull_alpha"
+    rule: Literal["hull_1", "hull_alpha", "area_ratio", "lbcp", "equilibrium", "none"] = (
+        "hull_alpha"
+    )
     margin: float | None = None
     thresholds: Literal["paper", "code"] | None = None
     orientations: list[int] = field(default_factory=lambda: list(ALL_ORIENTATIONS))

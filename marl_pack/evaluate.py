@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -31,6 +32,8 @@ from marl_pack.bins import check_device
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
+from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
+from marl_pack.sapien_check.packings import Bodies
 from marl_pack.stability import RULES, in_equilibrium
 from marl_pack.stability.candidates import NO_OFFSET
 
@@ -122,6 +125,32 @@ def strict_equilibrium(
     return stands
 
 
+def falls(
+    played: Episodes,
+    bodies: Bodies,
+    processes: int = 1,
+    progress: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:
+    """Judge every packing in physics, after each placement up to its first fall.
+
+    Keys ``falls`` (episodes in which something fell), ``judged`` (placements) and
+    ``judge_seconds`` (a placement).
+
+    Raises:
+        SimulationError: if a simulation diverges.
+    """
+    judged = []
+    for one in judge_all(bodies.stacks(played, range(len(played.packed))), processes=processes):
+        judged.append(one)
+        progress()
+    placements = sum(one.placements for one in judged)
+    return {
+        "falls": sum(one.fall is not None for one in judged),
+        "judged": placements,
+        "judge_seconds": sum(one.seconds for one in judged) / max(placements, 1),
+    }
+
+
 def mean_utilization(played: Episodes) -> dict[str, Any]:
     """Mean utilization with its 95 % interval (Student's, over episodes), and items packed.
 
@@ -159,9 +188,11 @@ def summary(played: Episodes, stands: NDArray[np.bool_]) -> dict[str, Any]:
 
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
     """Print the table, a row for each policy."""
-    table = Table(title=title)
+    table = Table(title=title, box=box.SIMPLE, pad_edge=False)
     table.add_column("policy", overflow="fold")
-    for column in ("episodes", "utilization %", "std", "items", "dec./s", "strict"):
+    physics = any("falls" in row for row in rows.values())
+    columns = ["episodes", "utilization %", "std", "items", "dec./s", "strict"]
+    for column in [*columns, "falls"] if physics else columns:
         table.add_column(column, justify="right", no_wrap=True)
     for name, row in rows.items():
         spread = ("", "")
@@ -176,11 +207,14 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
             f"{row['packed']:.2f}",
             f"{row['decisions_per_second']:,.0f}",
             f"{100 * row['strict_equilibrium']:.2f} %",
+            *([str(row["falls"])] if physics else []),
         )
     console.print(table)
     console.print(
         "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
         "strict: final stacks in strict equilibrium as a whole"
+        + ("\nfalls: episodes in which something fell, in physics" if physics else "")
+        * physics
     )
 
 
@@ -259,6 +293,10 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="of generated items and of random play (default: 0)")
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     add("--threads", type=int, default=1, help="of torch on the CPU (default: 1)")
+    add("--physics", action="store_true",
+        help="judge every packing in SAPIEN after each placement: the column falls")  # fmt: skip
+    Bodies.add_options(options)
+    add("--processes", type=int, default=1, help="that judge at once (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there")
     add("--save-stacks", type=Path, metavar="FILE", help="write the packed boxes there (.npz)")
     return options
@@ -333,6 +371,13 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
             check_writable(path)
+    bodies = Bodies.from_options(arguments) if arguments.physics else None
+    if bodies is not None:
+        load_sapien()  # says what to install before anything is played
+    elif arguments.cell or arguments.density or arguments.com_spread:
+        raise ValueError("--cell, --density and --com-spread go with --physics")
+    if arguments.processes < 1:
+        raise ValueError(f"--processes {arguments.processes}: needs 1 or more")
     stream, size = choose_stream(
         arguments.items, tuple(arguments.bin) if arguments.bin else None, tuple(arguments.sides)
     )
@@ -366,6 +411,11 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
             task = bar.add_task(f"{name}: equilibria", total=episodes)
             stands = strict_equilibrium(played, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # likewise
             rows[name] = summary(played, stands)
+            if bodies is not None:
+                task = bar.add_task(f"{name}: physics", total=episodes)
+                rows[name] |= falls(
+                    played, bodies, arguments.processes, lambda t=task: bar.advance(t, 1)  # type: ignore[misc]  # likewise
+                )  # fmt: skip
             unplayable = int((played.packed == 0).sum())
             if unplayable:
                 console.print(
@@ -399,7 +449,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
-    except (ValueError, OSError) as error:
+    except SimulationError as error:
+        options.exit(1, f"{options.prog}: {error}\n")
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         options.exit(2, f"{options.prog}: {error}\n")
     return 0
 

@@ -2,8 +2,8 @@
 
 Every rule has one signature, :data:`Rule`, and a name in :data:`RULES`; :func:`make_rule` binds its
 parameters. From the strictest to the loosest, ``hull_alpha`` ⊂ ``lbcp`` ⊂ ``equilibrium`` ⊂
-``hull_1``; ``area_ratio`` stands beside them and is not sound. What each says, one window at a
-time, is in :mod:`marl_pack.stability.reference`.
+``hull_1``; ``area_ratio`` and ``none`` stand beside them and are not sound. What each says, one
+window at a time, is in :mod:`marl_pack.stability.reference`.
 
 :func:`stable_mask` answers for plain NumPy arrays, without an environment.
 """
@@ -18,6 +18,7 @@ from marl_pack.stability.rules import (
     hull_alpha,
     lbcp,
     make_rule,
+    none,
 )
 from marl_pack.stability.static_equilibrium import in_equilibrium
 
@@ -33,5 +34,6 @@ __all__ = [
     "in_equilibrium",
     "lbcp",
     "make_rule",
+    "none",
     "stable_mask",
 ]

@@ -98,12 +98,21 @@ def equilibrium(
     return equilibrium_mask(bins, item, surely, possibly, margin, check_stack)
 
 
+def none(bins: Bins, item: Candidates) -> Tensor:
+    """No stability rule: wherever the item fits into the bin, set down from above.
+
+    To compare with, and for the judge to have something to say no to.
+    """
+    return area_ratio(bins, item, ((0.0, 0),))
+
+
 RULES: dict[str, Callable[..., Tensor]] = {
     "hull_1": hull_1,
     "hull_alpha": hull_alpha,
     "area_ratio": area_ratio,
     "lbcp": lbcp,
     "equilibrium": equilibrium,
+    "none": none,
 }
 
 

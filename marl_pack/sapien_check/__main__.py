@@ -1,0 +1,316 @@
+"""Judge stacks in physics: ``python -m marl_pack.sapien_check COMMAND``.
+
+- ``table1``: the paper's Table 1, objects set down at random under a stability rule;
+- ``controls``: stacks whose fate is known, and the margins at which the verdict flips;
+- ``stack FILE``: packings saved by ``python -m marl_pack.evaluate --save-stacks``; also pictures
+  and films.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from marl_pack.evaluate import Episodes, load_stacks
+from marl_pack.files import check_writable, write_atomically
+from marl_pack.sapien_check import controls, table1
+from marl_pack.sapien_check.judge import DEFAULT, Physics, SimulationError, Verdict, judge_all
+from marl_pack.sapien_check.packings import Bodies
+from marl_pack.stability import RULES
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+
+
+def _write_json(path: Path | None, report: dict[str, Any]) -> None:
+    if path is not None:
+        text = json.dumps(report, indent=2, allow_nan=False, default=str) + "\n"
+        write_atomically(path, lambda file: file.write(text.encode()))
+
+
+# --- table1 ---------------------------------------------------------------------------------------
+
+
+def run_table1(options: argparse.Namespace, console: Console) -> None:
+    """Play, judge and print Table 1."""
+    if options.objects < 1:
+        raise ValueError(f"--objects {options.objects}: needs 1 or more")
+    rows: dict[str, dict[str, Any]] = {}
+    with _progress(console) as bar:
+        for rule in dict.fromkeys(options.rules):
+            settings = table1.Settings(rule, None, options.seed, options.physics)
+            task = bar.add_task(f"{rule}: objects", total=options.objects)
+            bins = table1.run(
+                settings, options.objects, options.processes,
+                lambda done, task=task: bar.advance(task, done),  # type: ignore[misc]  # a default argument binds the task
+            )  # fmt: skip
+            rows[rule] = table1.summary(bins)
+            if options.save_falls and rows[rule]["falls"]:
+                path = options.save_falls.with_name(f"{options.save_falls.stem}_{rule}.npz")
+                kept = table1.stacks(bins)
+                write_atomically(path, lambda file, kept=kept: np.savez_compressed(file, **kept))  # type: ignore[misc]  # likewise
+                console.print(f"{path}: the bins in which something fell", soft_wrap=True)
+    show_table1(rows, console, f"Table 1, {options.objects:,} objects a rule, seed {options.seed}")
+    report = {"objects": options.objects, "seed": options.seed, "physics": asdict(options.physics)}
+    _write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
+
+
+def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -> None:
+    """Print a row for each rule, and the paper's own."""
+    table = Table(title=title, box=box.SIMPLE, padding=0)
+    table.add_column("rule", no_wrap=True)
+    for column in ("objects", "falls", "unst.", "held", "masks s", "s each", "judge"):
+        table.add_column(column, justify="right", no_wrap=True)
+
+    def falls(r: dict[str, Any]) -> str:
+        return f"{r['falls']} ({100 * r['rate']:.2f} %)"
+
+    for rule, r in rows.items():
+        table.add_row(
+            rule, str(r["objects"]), falls(r), str(r["falls_unstable"]),
+            str(r["unstable_standing"]), f"{r['mask_total']:.1f}", f"{r['mask_each']:.5f}",
+            f"{r['judge_each']:.3f}",
+        )  # fmt: skip
+    for rule in rows:
+        if rule in table1.PAPER:
+            r = table1.PAPER[rule]
+            table.add_row(
+                f"{rule}, paper", str(r["objects"]), falls(r), "", "", str(r["total"]), r["each"]
+            )
+    console.print(table)
+    console.print(
+        "unst.: falls whose stack the exact equilibrium calls unstable; held: stacks\n"
+        "that it calls unstable and that did not fall; masks s, s each: seconds of all\n"
+        "masks and of one; judge: seconds of a verdict (CPU time; the paper's own words)"
+    )
+
+
+# --- controls -------------------------------------------------------------------------------------
+
+
+def run_controls(options: argparse.Namespace, console: Console) -> bool:
+    """Judge the controls, print them, and say whether all were judged right."""
+    cases = controls.cases()
+    with _progress(console) as bar:
+        task = bar.add_task("controls", total=len(cases))
+        found = []
+        for name, margin, boxes in cases:
+            found.append(controls.outcome(name, margin, boxes, options.physics))
+            bar.advance(task)
+        task = bar.add_task("margins", total=len(controls.FAMILIES))
+        flips = {}
+        for name, make in controls.FAMILIES.items():
+            flips[name] = controls.flips_at(make, options.physics)
+            bar.advance(task)
+    table = Table(title="controls: + stands, - falls", box=box.SIMPLE, pad_edge=False)
+    table.add_column("stack", no_wrap=True)
+    margins = " ".join(f"{m:+g}" for m in controls.MARGINS)
+    columns = ("known", "judge", "exact", "all meet", "flips, mm")
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    for name in dict.fromkeys(o.name for o in found):
+        own = [o for o in found if o.name == name]
+
+        def signs(of: str, own: list[controls.Outcome] = own) -> str:
+            return " ".join("+" if getattr(o, of) else "-" for o in own)
+
+        at = flips.get(name)
+        flip = "" if at is None else "beyond 8" if math.isnan(at) else f"{at:+.3f}"
+        table.add_row(name, signs("known"), signs("judge"), signs("equilibrium"),
+                      signs("everything"), flip)  # fmt: skip
+    console.print(table)
+    right = {of: sum(getattr(o, of) == o.known for o in found)
+             for of in ("judge", "equilibrium", "everything")}  # fmt: skip
+    console.print(
+        f"{len(found)} controls, the decisive centre {margins} mm inside its support;\n"
+        f"judged right: {right['judge']}; by the exact equilibrium {right['equilibrium']}; "
+        f"where all boxes and walls meet {right['everything']}\n"
+        "flips: how far inside it is where the judge's verdict changes"
+    )
+    report = {
+        "controls": [asdict(o) for o in found],
+        "flips_at_mm": {name: None if math.isnan(at) else at for name, at in flips.items()},
+        "physics": asdict(options.physics),
+    }
+    _write_json(options.json, report)
+    return right["judge"] == len(found)
+
+
+# --- stack ----------------------------------------------------------------------------------------
+
+
+def run_stack(options: argparse.Namespace, console: Console) -> None:
+    """Judge saved packings; draw one of them."""
+    played = load_stacks(options.file)
+    bodies = Bodies.from_options(options)
+    chosen = range(len(played.packed)) if options.episodes is None else options.episodes
+    for e in chosen:
+        if not 0 <= e < len(played.packed):
+            raise ValueError(f"--episodes {e}: the file holds 0 … {len(played.packed) - 1}")
+    if options.render is not None:
+        if len(chosen) != 1:
+            raise ValueError("--render shows one stack: name it by --episodes K")
+        draw(played, chosen[0], bodies, options, console)
+    with _progress(console) as bar:
+        task = bar.add_task("episodes", total=len(chosen))
+        judged = []
+        for one in judge_all(bodies.stacks(played, chosen), options.physics, options.processes):
+            judged.append(one)
+            bar.advance(task)
+    falls = {e: j.fall for e, j in zip(chosen, judged, strict=True) if j.fall is not None}
+    for e, fall in list(falls.items())[:20]:
+        console.print(f"episode {e}: {told(fall)}", soft_wrap=True)
+    if len(falls) > 20:
+        console.print(f"… and {len(falls) - 20} more (--json keeps all)")
+    placements = sum(j.placements for j in judged)
+    seconds = sum(j.seconds for j in judged)
+    console.print(
+        f"{len(judged):,} packings, {placements:,} placements judged, {len(falls)} fell; "
+        f"{seconds / max(placements, 1):.3f} s a placement",
+        soft_wrap=True,
+    )
+    report = {
+        "file": str(options.file), "packings": len(judged), "placements": placements,
+        "bodies": asdict(bodies), "physics": asdict(options.physics),
+        "falls": [
+            {"episode": e, "placed": len(fall.distance), "moved": fall.moved,
+             "metres": fall.distance.tolist(), "degrees": fall.angle.tolist()}
+            for e, fall in falls.items()
+        ],
+    }  # fmt: skip
+    _write_json(options.json, report)
+
+
+def told(fall: Verdict) -> str:
+    """A fall in words."""
+    moved = ", ".join(
+        f"{i} by {1000 * fall.distance[i]:.1f} mm and {fall.angle[i]:.1f}°" for i in fall.moved
+    )
+    return f"placing box {len(fall.distance) - 1} moved box {moved}"
+
+
+def draw(
+    played: Episodes, e: int, bodies: Bodies, options: argparse.Namespace, console: Console
+) -> None:
+    """Write the picture or film of one episode."""
+    from marl_pack.sapien_check import film  # needs a renderer, which nothing else does
+
+    stack = bodies.stack(played, e)
+    title = f"{options.file.stem}, episode {e}: {len(stack)} boxes"
+    frame = film.render(stack, options.render, title, options.physics)
+    state = f"box {', '.join(map(str, frame.moved))} moved" if frame.moved else "nothing moved"
+    console.print(f"{options.render}: all boxes and walls collide; {state}", soft_wrap=True)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    options = argparse.ArgumentParser(
+        prog="python -m marl_pack.sapien_check",
+        description="Judge stacks in physics (SAPIEN, on the CPU).",
+    )
+    commands = options.add_subparsers(dest="command", required=True)
+    shared = argparse.ArgumentParser(add_help=False)
+    add = shared.add_argument
+    add("--friction", type=float, default=DEFAULT.friction,
+        help=f"between all faces (default: {DEFAULT.friction})")  # fmt: skip
+    add("--everything", action="store_true",
+        help="let all boxes and the walls collide, as in a real bin: neighbours then prop up what "
+             "would fall")  # fmt: skip
+    add("--json", type=Path, metavar="FILE", help="write the figures there")
+    several = argparse.ArgumentParser(add_help=False)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    told = f"that work at once (default: 1; here are {cores} cores)"
+    several.add_argument("--processes", type=int, default=1, help=told)
+
+    first = commands.add_parser(
+        "table1", parents=[shared, several], help="the paper's Table 1", description=table1.__doc__
+    )
+    add = first.add_argument
+    add("--rules", nargs="+", choices=list(RULES), default=["hull_1", "hull_alpha"],
+        help="stability rules (default: the paper's two)")  # fmt: skip
+    add("--objects", type=int, default=3000, help="placed under each rule (default: 3000)")
+    add("--seed", type=int, default=0, help="of objects and cells (default: 0)")
+    add("--save-falls", type=Path, metavar="FILE",
+        help="keep the bins in which something fell, as FILE_RULE.npz, for the command "
+             "stack")  # fmt: skip
+
+    commands.add_parser(
+        "controls", parents=[shared], help="stacks whose fate is known",
+        description=controls.__doc__,
+    )  # fmt: skip
+
+    stack = commands.add_parser(
+        "stack", parents=[shared, several], help="packings saved by evaluate --save-stacks",
+        description="Judge saved packings after each of their placements.",
+    )  # fmt: skip
+    add = stack.add_argument
+    add("file", type=Path, help="from python -m marl_pack.evaluate --save-stacks")
+    add("--episodes", nargs="+", type=int, metavar="K", help="which of them (default: all)")
+    Bodies.add_options(stack)
+    add("--seed", type=int, default=0, help="of drawn bodies (default: 0)")
+    add("--render", type=Path, metavar="FILE",
+        help="show the stack being built: a film (.mp4, .gif) or its end (.png)")  # fmt: skip
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command ``python -m marl_pack.sapien_check``."""
+    options = parser().parse_args(arguments)
+    console = Console()
+    try:
+        if not (math.isfinite(options.friction) and options.friction >= 0):
+            raise ValueError(f"--friction {options.friction}: needs a number, 0 or more")
+        if getattr(options, "processes", 1) < 1:
+            raise ValueError(f"--processes {options.processes}: needs 1 or more")
+        if getattr(options, "seed", 0) < 0:
+            raise ValueError(f"--seed {options.seed}: needs 0 or more")
+        for path in (options.json, getattr(options, "save_falls", None)):
+            if path is not None:
+                check_writable(path)
+        options.physics = replace(
+            Physics(), friction=options.friction, everything=options.everything
+        )
+        if options.command == "table1":
+            run_table1(options, console)
+        elif options.command == "controls":
+            return 0 if run_controls(options, console) else 1
+        else:
+            run_stack(options, console)
+    except SimulationError as error:
+        print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
+        return 1
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

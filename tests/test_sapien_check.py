@@ -1,0 +1,339 @@
+"""The judge: stacks whose fate is known, what collides with what, what is refused at the door."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marl_pack import evaluate
+from marl_pack.evaluate import load_stacks
+from marl_pack.packing import Packing
+from marl_pack.sapien_check import (
+    Physics,
+    SimulationError,
+    Stack,
+    check,
+    controls,
+    film,
+    judge,
+    judge_all,
+    table1,
+)
+from marl_pack.sapien_check.__main__ import main
+from marl_pack.sapien_check.judge import GROUND_BIT, World, collision_groups
+from marl_pack.sapien_check.packings import Bodies
+
+BIN = (10, 10, 10)
+TIMES = ("mask_total", "mask_each", "mask_low", "mask_high", "judge_each")
+FLAT = (0, 0, 0, 4, 4, 2)
+
+
+def stack(*boxes: tuple[float, ...], **named: object) -> Stack:
+    return Stack.of_cells(BIN, boxes, **{"density": 500.0, **named})  # type: ignore[arg-type]
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("boxes", "named", "told"), [
+    ([FLAT, (3, 3, 0, 2, 2, 2)], {}, r"box 1 \(3, 3, 0, 2, 2, 2\) overlaps box 0 \(0, 0, 0"),
+    ([FLAT, (8, 0, 0, 3, 1, 1)], {}, r"box 1 .*: reaches out of the bin"),
+    ([(0, 0, 9, 1, 1, 2)], {}, r"box 0 .*: reaches out of the bin"),
+    ([(-1, 0, 0, 2, 2, 2)], {}, r"box 0 .*: reaches out of the bin"),
+    ([FLAT, (0, 0, 3, 2, 2, 2)], {}, r"box 1 .*: floats"),
+    ([FLAT, (4, 4, 2, 2, 2, 2)], {}, r"box 1 .*: floats"),  # it touches a corner only
+    ([(0, 0, 2, 2, 2, 2), FLAT], {}, r"box 0 .*: floats"),  # what carries it comes later
+    ([(0, 0, float("nan"), 2, 2, 2)], {}, r"box 0 .*: needs finite numbers"),
+    ([FLAT, (0, 0, 2, 0, 2, 2)], {}, r"box 1 .*: needs sides longer than 0"),
+    ([FLAT], {"density": None}, r"either the density \(kg/m³\) or the mass"),
+    ([FLAT], {"mass": 1.0}, r"either the density"),
+    ([FLAT, (4, 4, 0, 1, 1, 1)], {"density": [500, 0]}, r"box 1 \(0\): needs a positive mass"),
+    ([FLAT], {"density": float("nan")}, r"box 0 .*positive mass"),
+    ([FLAT], {"density": [1, 2]}, r"density or mass: shape \(2,\), needs \(\) or \(1,\)"),
+    ([FLAT], {"com_offset": (0.5, 0, 0)}, r"box 0 .*centre of mass inside the box"),
+    ([FLAT], {"com_offset": (0, 0)}, r"com_offset: shape \(2,\)"),
+    ([FLAT], {"cell": 0.0}, r"cell = 0\.0: needs a positive length"),
+    ([(0, 0, 0, 1, 1)], {}, r"needs \[n, 6\]"),
+])  # fmt: skip
+def test_a_stack_that_cannot_be_is_refused_with_the_box_named(
+    boxes: list[tuple[float, ...]], named: dict[str, object], told: str
+) -> None:
+    with pytest.raises(ValueError, match=told):
+        stack(*boxes, **named)
+
+
+def test_the_bin_itself_must_be_one() -> None:
+    with pytest.raises(ValueError, match="three positive numbers"):
+        Stack.of_cells((1, 2, 0), [FLAT], density=1.0)
+
+
+def test_sizes_that_the_thresholds_do_not_suit_are_refused() -> None:
+    with pytest.raises(ValueError, match="choose another cell size"):
+        check(stack((0, 0, 0, 1, 1, 1), cell=0.005))
+    with pytest.raises(ValueError, match="choose another cell size"):
+        check(stack(FLAT, cell=2.0))
+
+
+def test_a_simulation_that_breaks_down_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def far(self: World, seconds: float) -> None:
+        self.set_poses(np.array([[1e4, 0, 0]]), np.array([[1.0, 0, 0, 0]]))
+
+    monkeypatch.setattr(World, "run", far)
+    with pytest.raises(SimulationError, match="1 km"):
+        check(stack(FLAT))
+
+
+# --- units and contacts ---------------------------------------------------------------------------
+
+
+def test_cells_become_metres_and_kilograms() -> None:
+    made = stack(FLAT, (0, 0, 2, 2, 4, 1), cell=0.1, com_offset=(0.25, 0, -0.25))
+    assert made.size == pytest.approx([1, 1, 1])
+    assert made.low[1] == pytest.approx([0, 0, 0.2])
+    assert made.sides[1] == pytest.approx([0.2, 0.4, 0.1])
+    assert made.mass == pytest.approx([500 * 0.032, 500 * 0.008])
+    assert made.com[1] == pytest.approx([0.05, 0, -0.025])
+    assert stack(FLAT).size == pytest.approx([0.6, 0.6, 0.6])  # the paper's bin
+    assert stack(FLAT, density=None, mass=7.0).mass == pytest.approx([7])
+
+
+def test_faces_that_share_an_edge_only_do_not_touch() -> None:
+    made = stack(FLAT, (4, 0, 0, 2, 4, 2), (0, 0, 2, 4, 4, 1), (4, 0, 2, 2, 2, 2))
+    assert np.argwhere(made.rests_on()).tolist() == [[2, 0], [3, 1]]
+
+
+def random_stack(seed: int) -> Stack:
+    """Small boxes set down anywhere: many close to one another."""
+    game = Packing(1, (12, 12, 12), sides=(1, 4), rule="none", auto_reset=False, seed=seed)
+    draw = np.random.default_rng(seed)
+    while bool(game.alive):
+        orientation, cell = divmod(int(draw.choice(np.flatnonzero(game.mask[0].numpy()))), 144)
+        game.place(*(game.items.new_tensor([k]).long() for k in (orientation, cell)))
+    boxes = game.bins.boxes[0, : int(game.bins.count)].numpy()
+    return Stack.of_cells((12, 12, 12), boxes, density=300.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_rests_on_another_collides_with_it_and_no_neighbour_does(seed: int) -> None:
+    made = random_stack(seed)
+    assert len(made) > 20
+    groups = np.array(collision_groups(made, Physics()), np.int64)
+    first, second = groups[:, 0], groups[:, 1]
+    collide = ((first[:, None] & second) | (second[:, None] & first)) > 0
+    on = made.rests_on()
+    touch = on | on.T
+    assert collide[touch].all()
+    gap = np.maximum(made.low[:, None], made.low) - np.minimum(made.high[:, None], made.high)
+    near = (gap < 0.01).all(-1) & ~np.eye(len(made), dtype=bool)
+    assert not (collide & near & ~touch).any()
+    assert (((second >> GROUND_BIT) & 1) == (made.low[:, 2] < 1e-6)).all()
+    assert not ((first >> GROUND_BIT) & 1).any()
+
+
+# --- verdicts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("margin", [0.2, -0.2])
+@pytest.mark.parametrize("name", controls.FAMILIES)
+def test_a_control_is_judged_right_a_fifth_of_a_millimetre_from_tipping(
+    name: str, margin: float
+) -> None:
+    boxes = controls.FAMILIES[name](margin)
+    assert check(boxes.stack()).stands == (margin > 0)
+    assert boxes.stands() == (margin > 0)
+
+
+@pytest.mark.parametrize("name", controls.STANDING)
+def test_what_stands_with_room_to_spare_stands(name: str) -> None:
+    boxes = controls.STANDING[name]()
+    verdict = check(boxes.stack())
+    assert verdict.stands
+    assert verdict.passes == 1
+    assert verdict.distance.max() < 1e-3
+
+
+def test_a_verdict_says_what_moved_and_how_far() -> None:
+    made = stack(FLAT, (6, 6, 0, 2, 2, 2), (2, 0, 2, 5, 4, 1))  # its middle 0.5 cells over the edge
+    verdict = check(made)
+    assert not verdict.stands
+    assert verdict.moved == (2,)
+    assert verdict.angle[2] > 1
+    assert verdict.distance[1] < 1e-4
+    assert verdict.passes == 3  # it has fallen three times
+
+
+def test_judging_ends_at_the_first_fall() -> None:
+    made = stack(FLAT, (2, 0, 2, 5, 4, 1), (0, 4, 0, 1, 1, 1))
+    assert [verdict.stands for verdict in judge(made)] == [True, False]
+    assert list(judge(made.first(0))) == []
+    assert check(made.first(0)).stands
+
+
+def test_where_all_boxes_collide_a_neighbour_props_up_what_falls() -> None:
+    made = controls.propped(0.0, 100.0, -5.0).stack()
+    assert not check(made).stands
+    assert check(made, Physics(everything=True)).stands
+
+
+def test_walls_hold_where_they_collide() -> None:
+    """A plate that tips off its post, with room around it or just as wide as the bin."""
+    boxes = np.array([(0, 0, 0, 40, 50, 50), (0, 0, 50, 99, 50, 5)])
+    room = Stack.of_cells(
+        (200, 200, 100), boxes + np.array((50, 70, 0, 0, 0, 0)), cell=0.005, density=500.0
+    )
+    tight = Stack.of_cells((200, 50, 100), boxes, cell=0.005, density=500.0)
+    assert not check(room, Physics(everything=True)).stands
+    assert not check(tight).stands
+    assert check(tight, Physics(everything=True)).stands
+
+
+def test_a_centre_of_mass_decides() -> None:
+    leaning = stack(FLAT, (2, 0, 2, 4, 4, 4), com_offset=[(0, 0, 0), (0.1, 0, 0)])
+    assert not check(leaning).stands
+    held = stack(FLAT, (2, 0, 2, 4, 4, 4), com_offset=[(0, 0, 0), (-0.1, 0, 0)])
+    assert check(held).stands
+
+
+def test_several_processes_judge_alike() -> None:
+    made = [stack(FLAT, (2, 0, 2, 5, 4, 1)), stack(FLAT), stack(FLAT, (0, 0, 2, 4, 4, 1))]
+    alone = list(judge_all(made))
+    both = list(judge_all(made, processes=2))
+    assert [j.placements for j in alone] == [j.placements for j in both] == [2, 1, 2]
+    assert [j.fall is None for j in alone] == [j.fall is None for j in both] == [False, True, True]
+    assert alone[0].fall is not None
+    assert both[0].fall is not None
+    assert (alone[0].fall.distance == both[0].fall.distance).all()
+
+
+# --- packings and commands ------------------------------------------------------------------------
+
+
+def test_bodies_are_drawn_within_their_bounds_and_the_same_again(tmp_path: Path) -> None:
+    path = tmp_path / "s.npz"
+    evaluate.main(["--episodes", "3", "--save-stacks", str(path)])
+    played = load_stacks(path)
+    plain = Bodies().stack(played, 1)
+    assert plain.mass == pytest.approx(500 * plain.sides.prod(1))
+    assert plain.com == pytest.approx(np.zeros((len(plain), 3)))
+    drawn = Bodies(density=(100.0, 1000.0), com_spread=0.2, seed=4)
+    made = drawn.stack(played, 1)
+    density = made.mass / made.sides.prod(1)
+    assert ((density >= 100) & (density <= 1000)).all()
+    assert density.max() > 2 * density.min()
+    off = np.abs(made.com / made.sides)
+    assert off.max() <= 0.2
+    assert off.max() > 0.1
+    again = drawn.stack(played, 1)
+    assert (again.mass == made.mass).all()
+    other = drawn.stack(played, 2)
+    assert not np.array_equal(other.com[:5], made.com[:5])
+
+
+@pytest.mark.parametrize("named", [
+    {"density": (0.0, 1.0)}, {"density": (2.0, 1.0)}, {"com_spread": 0.5}, {"com_spread": -0.1},
+    {"seed": -1}, {"density": (1.0, float("inf"))},
+])  # fmt: skip
+def test_bodies_that_cannot_be_are_refused(named: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="needs"):
+        Bodies(**named)  # type: ignore[arg-type]
+
+
+def test_evaluate_tells_falls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.json"
+    for rule, some in (("hull_alpha", False), ("none", True)):
+        arguments = f"--policy dblf --rule {rule} --episodes 8 --physics --json {out}"
+        assert evaluate.main(arguments.split()) == 0
+        row = json.loads(out.read_text())["policies"]["dblf"]
+        assert (row["falls"] > 0) == some
+        assert row["judged"] <= 8 * row["packed"] + 1e-9
+        assert "falls" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        evaluate.main(["--com-spread", "0.1"])
+    assert "go with --physics" in capsys.readouterr().err
+
+
+def test_saved_stacks_are_judged_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "s.npz", tmp_path / "out.json"
+    evaluate.main(["--rule", "none", "--policy", "random", "--episodes", "4",
+                   "--save-stacks", str(path)])  # fmt: skip
+    assert main(["stack", str(path), "--json", str(out)]) == 0
+    report = json.loads(out.read_text())
+    assert report["packings"] == 4
+    fall = report["falls"][0]
+    assert f"episode {fall['episode']}: placing box {fall['placed'] - 1} moved box" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    picture = tmp_path / "s.png"
+    shown = ["stack", str(path), "--episodes", str(fall["episode"]), "--render", str(picture)]
+    assert main(shown) == 0
+    assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".npz", ".png"]
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    ("stack nowhere.npz", "nowhere.npz"),
+    ("table1 --objects 0", "--objects 0"),
+    ("table1 --processes 0", "--processes 0"),
+    ("table1 --seed -1", "--seed -1"),
+    ("controls --friction nan", "--friction nan"),
+    ("table1 --json nowhere/x.json", "does not exist"),
+])  # fmt: skip
+def test_what_the_command_cannot_do_is_told(
+    arguments: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments.split()) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_table1_does_not_depend_on_the_processes_and_counts_falls(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, falls = tmp_path / "t.json", tmp_path / "falls"
+    options = ["--objects", "20", "--json", str(out), "--save-falls", str(falls)]
+    rows = []
+    for more in (["--rules", "none", "hull_alpha"], ["--rules", "none", "--processes", "2"]):
+        assert main(["table1", *options, *more]) == 0
+        rules = json.loads(out.read_text())["rules"]
+        rows.append({rule: {key: value for key, value in row.items() if key not in TIMES}
+                     for rule, row in rules.items()})  # fmt: skip
+    assert rows[0]["none"] == rows[1]["none"]
+    assert rows[0]["none"]["objects"] == 20
+    assert rows[0]["none"]["falls"] > 0
+    assert rows[0]["none"]["falls"] == rows[0]["none"]["falls_unstable"]
+    assert rows[0]["hull_alpha"]["falls"] == 0
+    assert "153" not in capsys.readouterr().out  # the paper's hull_1 is not asked for
+    kept = load_stacks(tmp_path / "falls_none.npz")
+    assert len(kept.packed) == rows[0]["none"]["falls"]
+    judged = list(judge_all(Bodies(cell=table1.CELL).stacks(kept, range(len(kept.packed)))))
+    assert all(j.fall is not None for j in judged)
+    assert [j.placements for j in judged] == kept.packed.tolist()
+
+
+def test_a_film_shows_the_fall(tmp_path: Path) -> None:
+    made = controls.FAMILIES["box 10 times heavier on a light one"](-20.0).stack()
+    frames = list(film.simulate(made))
+    assert [len(f.middles) for f in frames[:1] + frames[-1:]] == [1, 3]
+    assert frames[-1].moved
+    assert frames[-1].middles[2, 2] == pytest.approx(0.05, abs=0.01)  # the heavy one is down
+    path = tmp_path / "fall.gif"
+    assert film.render(made, path, "falls").moved
+    assert path.read_bytes()[:4] == b"GIF8"
+    with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4"):
+        film.render(made, tmp_path / "fall.avi")
+    with pytest.raises(ValueError, match="no boxes"):
+        film.render(made.first(0), path)
+
+
+def test_without_sapien_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    from marl_pack.sapien_check.judge import load_sapien
+
+    load_sapien.cache_clear()
+    monkeypatch.setitem(sys.modules, "sapien", None)
+    with pytest.raises(ModuleNotFoundError, match=r"marl_pack\[physics\]"):
+        check(stack(FLAT))
+    load_sapien.cache_clear()
