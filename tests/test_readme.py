@@ -1,18 +1,22 @@
-"""The README's examples run as they stand."""
+"""The examples of the README and of the docs run as they stand."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parent.parent / "README.md"
-EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+ROOT = Path(__file__).parent.parent
+EXAMPLES = [
+    code
+    for name in ("README.md", "docs/physics.md")
+    for code in re.findall(r"```python\n(.*?)```", (ROOT / name).read_text("utf-8"), re.DOTALL)
+]
 
 
 @pytest.mark.parametrize("code", EXAMPLES)
-def test_an_example_of_the_readme_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
-    exec(compile(code, "README.md", "exec"), {})
+def test_an_example_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(code, "example", "exec"), {})
     printed = capsys.readouterr().out.strip()
-    promised = re.search(r"print\(.*\)  # (\[[^\]]*\])", code)
+    promised = re.search(r"print\(.*\)  # ([^:\n]*)", code)
     assert printed == promised[1] if promised else printed
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 4
