@@ -30,8 +30,7 @@ the bin's volume (Eq. 5-7); after each orientation both get 0.
 **End.** Both agents terminate together when the next item has no legal action (or there is none),
 and are truncated together after ``max_cycles`` items.
 
-**Info.** For both agents ``utilization`` (share of the bin filled), ``packed`` (boxes in it) and
-``active_agent`` (whose turn it is).
+**Info.** For both agents ``utilization`` (share of the bin filled) and ``packed`` (boxes in it).
 
 Version history: v0, first release.
 """
@@ -102,8 +101,24 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
     """
     if simultaneous and kwargs.get("illegal") != "repair":
         raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
-    convert = aec_to_parallel_wrapper if simultaneous else turn_based_aec_to_parallel_wrapper
-    return convert(env(**kwargs))
+    return (aec_to_parallel_wrapper if simultaneous else Turns)(env(**kwargs))
+
+
+class Turns(turn_based_aec_to_parallel_wrapper):
+    """PettingZoo's turn-by-turn view; every info says whose turn it is, after a reset as well."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode."""
+        return self._tell(*super().reset(seed=seed, options=options))
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        """Play the action of the agent whose turn it is."""
+        return self._tell(*super().step(actions))
+
+    def _tell(self, *returned: Any) -> Any:
+        for info in returned[-1].values():
+            info["active_agent"] = self.aec_env.agent_selection
+        return returned
 
 
 class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
@@ -364,7 +379,6 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         info: dict[str, Any] = {
             "utilization": self.utilization,
             "packed": self._packed,
-            "active_agent": self.agent_selection,
         }
         if self.mask_in == "info":
             info["action_mask"] = self._mask(agent)
