@@ -324,7 +324,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     def _legal(self, agent: str, action: int | None) -> tuple[int, bool]:
         """The action to play, and whether it had to be repaired."""
-        mask = self._mask(agent)
+        mask = self.action_mask(agent)
         if action is None or not 0 <= int(action) < len(mask):
             raise ValueError(f"{agent}: action {action} is not in 0 … {len(mask) - 1}")
         if mask[int(action)]:
@@ -366,7 +366,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             planes[4] = self._chosen is not None
         return planes
 
-    def _mask(self, agent: str) -> NDArray[np.int8]:
+    def action_mask(self, agent: str) -> NDArray[np.int8]:
         """The agent's legal actions; none when it is not its turn."""
         mask = np.zeros(self.action_spaces[agent].n, np.int8)
         if agent == ORIENTATION and self._chosen is None:
@@ -381,7 +381,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             "packed": self._packed,
         }
         if self.mask_in == "info":
-            info["action_mask"] = self._mask(agent)
+            info["action_mask"] = self.action_mask(agent)
         return info
 
     def observe(self, agent: str) -> Any:
@@ -389,7 +389,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         planes = self._planes(agent == PLACEMENT, self.pad_actions)
         if self.mask_in == "info":
             return planes
-        return {"observation": planes, "action_mask": self._mask(agent)}
+        return {"observation": planes, "action_mask": self.action_mask(agent)}
 
     def state(self) -> NDArray[np.float32]:
         """Float32 [5, W, D]: heightmap, the item as it lies now, and whose turn it is (0, 1)."""

@@ -39,6 +39,7 @@ from marl_pack.stability.candidates import NO_OFFSET
 
 BATCH = 1024  # bins played at once, at most
 BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
+NOT_STACKS = "not a file of stacks from evaluate --save-stacks"
 EPISODES = 1000  # of a generated stream, unless told
 DEFAULTS: dict[str, Any] = {
     "items": "rs", "bin": None, "sides": DEFAULT_SIDES, "rule": "hull_alpha", "margin": None,
@@ -133,11 +134,8 @@ def falls(
 ) -> dict[str, Any]:
     """Judge every packing in physics, after each placement up to its first fall.
 
-    Keys ``falls`` (episodes in which something fell), ``judged`` (placements) and
-    ``judge_seconds`` (a placement).
-
-    Raises:
-        SimulationError: if a simulation diverges.
+    Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
+    judged), ``judged`` (placements) and ``judge_seconds`` (a placement).
     """
     judged = []
     for one in judge_all(bodies.stacks(played, range(len(played.packed))), processes=processes):
@@ -146,6 +144,7 @@ def falls(
     placements = sum(one.placements for one in judged)
     return {
         "falls": sum(one.fall is not None for one in judged),
+        "no_verdict": sum(one.error is not None for one in judged),
         "judged": placements,
         "judge_seconds": sum(one.seconds for one in judged) / max(placements, 1),
     }
@@ -214,7 +213,6 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
         "strict: final stacks in strict equilibrium as a whole"
         + ("\nfalls: episodes in which something fell, in physics" if physics else "")
-        * physics
     )
 
 
@@ -241,19 +239,25 @@ def load_stacks(path: str | Path) -> Episodes:
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            size = tuple(int(s) for s in archive["bin"])
-            return Episodes(
-                (size[0], size[1], size[2]),
-                archive["utilization"],
-                archive["count"],
-                archive["boxes"],
-                archive["loads"],
-                float("nan"),
-            )
-    except FileNotFoundError:
+            size, boxes = archive["bin"], archive["boxes"]
+            count, loads, reached = archive["count"], archive["loads"], archive["utilization"]
+    except OSError as error:
+        if Path(path).is_file():
+            raise ValueError(f"{path}: {NOT_STACKS}") from error
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a file of stacks from evaluate --save-stacks") from error
+        raise ValueError(f"{path}: {NOT_STACKS}") from error
+    e, most = boxes.shape[:2] if boxes.ndim == 3 else (0, 0)
+    right = (
+        size.shape == (3,) and boxes.shape == (e, most, 6) and loads.shape == (e, most, 3)
+        and count.shape == reached.shape == (e,)
+        and all(np.issubdtype(a.dtype, np.integer) for a in (size, boxes, count))
+        and bool(((count >= 0) & (count <= most)).all())
+    )  # fmt: skip
+    if not right:
+        raise ValueError(f"{path}: {NOT_STACKS}: its arrays do not go together")
+    w, d, h = (int(s) for s in size)
+    return Episodes((w, d, h), reached, count, boxes, loads, float("nan"))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -290,7 +294,12 @@ def parser() -> argparse.ArgumentParser:
     add("--com-offset", nargs=3, type=float, metavar=("X", "Y", "Z"),
         help="centre of mass of the items from their middle, in fractions of w, d, h")  # fmt: skip
     add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
-    add("--seed", type=int, default=0, help="of generated items and of random play (default: 0)")
+    add(
+        "--seed",
+        type=int,
+        default=0,
+        help="of generated items, random play and drawn bodies (default: 0)",
+    )
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     add("--threads", type=int, default=1, help="of torch on the CPU (default: 1)")
     add("--physics", action="store_true",
@@ -374,7 +383,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     bodies = Bodies.from_options(arguments) if arguments.physics else None
     if bodies is not None:
         load_sapien()  # says what to install before anything is played
-    elif arguments.cell or arguments.density or arguments.com_spread:
+    elif any(getattr(arguments, key) is not None for key in ("cell", "density", "com_spread")):
         raise ValueError("--cell, --density and --com-spread go with --physics")
     if arguments.processes < 1:
         raise ValueError(f"--processes {arguments.processes}: needs 1 or more")
@@ -411,11 +420,6 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
             task = bar.add_task(f"{name}: equilibria", total=episodes)
             stands = strict_equilibrium(played, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # likewise
             rows[name] = summary(played, stands)
-            if bodies is not None:
-                task = bar.add_task(f"{name}: physics", total=episodes)
-                rows[name] |= falls(
-                    played, bodies, arguments.processes, lambda t=task: bar.advance(t, 1)  # type: ignore[misc]  # likewise
-                )  # fmt: skip
             unplayable = int((played.packed == 0).sum())
             if unplayable:
                 console.print(
@@ -424,6 +428,13 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
                 )
             if arguments.save_stacks:
                 save_stacks(arguments.save_stacks, played)
+            if bodies is not None:
+                task = bar.add_task(f"{name}: physics", total=episodes)
+                rows[name] |= falls(
+                    played, bodies, arguments.processes, lambda t=task: bar.advance(t, 1)  # type: ignore[misc]  # likewise
+                )  # fmt: skip
+                if rows[name]["no_verdict"]:
+                    console.print(f"{name}: {rows[name]['no_verdict']} episodes without a verdict")
     title = f"{arguments.items}, bin {' x '.join(map(str, size))}, rule {arguments.rule}"
     if parameters:
         title += f" ({', '.join(f'{k} {v}' for k, v in parameters.items())})"
@@ -433,6 +444,8 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         title += ", no mask of orientations"
     if any(arguments.com_offset):
         title += f", centre of mass off by {' '.join(f'{o:g}' for o in arguments.com_offset)}"
+    if bodies is not None and str(bodies):
+        title += f"; {bodies}"
     show(rows, title, console)
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
@@ -449,8 +462,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
-    except SimulationError as error:
+    except SimulationError as error:  # a process that judged has died
         options.exit(1, f"{options.prog}: {error}\n")
+    except KeyboardInterrupt:
+        options.exit(130, f"{options.prog}: interrupted\n")
     except (ValueError, OSError, ModuleNotFoundError) as error:
         options.exit(2, f"{options.prog}: {error}\n")
     return 0

@@ -13,6 +13,8 @@ def check_writable(path: Path) -> None:
     """Raise ValueError if a file cannot be written there."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path}: the folder {path.parent} may not be written to")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name a file")
 
@@ -30,9 +32,7 @@ def moved_into_place(path: Path) -> Iterator[Path]:
 
 def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
     """Write a file under another name and move it into place, so that it is whole or not there."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with moved_into_place(path) as part, part.open("wb") as file:
         write(file)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)

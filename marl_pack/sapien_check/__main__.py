@@ -60,8 +60,12 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
     if options.objects < 1:
         raise ValueError(f"--objects {options.objects}: needs 1 or more")
     rows: dict[str, dict[str, Any]] = {}
+    rules = list(dict.fromkeys(options.rules))
+    if options.save_falls is not None:
+        for rule in rules:
+            check_writable(falls_file(options.save_falls, rule))
     with _progress(console) as bar:
-        for rule in dict.fromkeys(options.rules):
+        for rule in rules:
             settings = table1.Settings(rule, None, options.seed, options.physics)
             task = bar.add_task(f"{rule}: objects", total=options.objects)
             bins = table1.run(
@@ -70,13 +74,18 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
             )  # fmt: skip
             rows[rule] = table1.summary(bins)
             if options.save_falls and rows[rule]["falls"]:
-                path = options.save_falls.with_name(f"{options.save_falls.stem}_{rule}.npz")
+                path = falls_file(options.save_falls, rule)
                 kept = table1.stacks(bins)
                 write_atomically(path, lambda file, kept=kept: np.savez_compressed(file, **kept))  # type: ignore[misc]  # likewise
                 console.print(f"{path}: the bins in which something fell", soft_wrap=True)
     show_table1(rows, console, f"Table 1, {options.objects:,} objects a rule, seed {options.seed}")
     report = {"objects": options.objects, "seed": options.seed, "physics": asdict(options.physics)}
     _write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
+
+
+def falls_file(path: Path, rule: str) -> Path:
+    """Where the bins go in which something fell under one rule."""
+    return path.with_name(f"{path.name.removesuffix('.npz')}_{rule}.npz")
 
 
 def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -> None:
@@ -167,10 +176,11 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     """Judge saved packings; draw one of them."""
     played = load_stacks(options.file)
     bodies = Bodies.from_options(options)
-    chosen = range(len(played.packed)) if options.episodes is None else options.episodes
+    every = range(len(played.packed))
+    chosen = every if options.episodes is None else list(dict.fromkeys(options.episodes))
     for e in chosen:
-        if not 0 <= e < len(played.packed):
-            raise ValueError(f"--episodes {e}: the file holds 0 … {len(played.packed) - 1}")
+        if e not in every:
+            raise ValueError(f"--episodes {e}: the file holds {len(every)}, counted from 0")
     if options.render is not None:
         if len(chosen) != 1:
             raise ValueError("--render shows one stack: name it by --episodes K")
@@ -186,10 +196,14 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
         console.print(f"episode {e}: {told(fall)}", soft_wrap=True)
     if len(falls) > 20:
         console.print(f"… and {len(falls) - 20} more (--json keeps all)")
+    errors = {e: j.error for e, j in zip(chosen, judged, strict=True) if j.error is not None}
+    for e, error in list(errors.items())[:20]:
+        console.print(f"episode {e}: no verdict: {error}", soft_wrap=True)
     placements = sum(j.placements for j in judged)
     seconds = sum(j.seconds for j in judged)
     console.print(
-        f"{len(judged):,} packings, {placements:,} placements judged, {len(falls)} fell; "
+        f"{len(judged):,} packings, {placements:,} placements judged, {len(falls)} fell, "
+        f"{len(errors)} without a verdict; "
         f"{seconds / max(placements, 1):.3f} s a placement",
         soft_wrap=True,
     )
@@ -197,20 +211,23 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
         "file": str(options.file), "packings": len(judged), "placements": placements,
         "bodies": asdict(bodies), "physics": asdict(options.physics),
         "falls": [
-            {"episode": e, "placed": len(fall.distance), "moved": fall.moved,
+            {"episode": e, "boxes": len(fall.distance), "moved": fall.moved,
              "metres": fall.distance.tolist(), "degrees": fall.angle.tolist()}
             for e, fall in falls.items()
         ],
+        "errors": errors,
     }  # fmt: skip
     _write_json(options.json, report)
 
 
 def told(fall: Verdict) -> str:
     """A fall in words."""
-    moved = ", ".join(
-        f"{i} by {1000 * fall.distance[i]:.1f} mm and {fall.angle[i]:.1f}°" for i in fall.moved
+    farthest = max(fall.moved, key=lambda i: fall.angle[i])
+    others = f" and {len(fall.moved) - 1} more" if len(fall.moved) > 1 else ""
+    return (
+        f"placing box {len(fall.distance) - 1} moved box {farthest} by "
+        f"{1000 * fall.distance[farthest]:.1f} mm and {fall.angle[farthest]:.1f}°{others}"
     )
-    return f"placing box {len(fall.distance) - 1} moved box {moved}"
 
 
 def draw(
@@ -285,15 +302,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     console = Console()
     try:
-        if not (math.isfinite(options.friction) and options.friction >= 0):
-            raise ValueError(f"--friction {options.friction}: needs a number, 0 or more")
         if getattr(options, "processes", 1) < 1:
             raise ValueError(f"--processes {options.processes}: needs 1 or more")
         if getattr(options, "seed", 0) < 0:
             raise ValueError(f"--seed {options.seed}: needs 0 or more")
-        for path in (options.json, getattr(options, "save_falls", None)):
-            if path is not None:
-                check_writable(path)
+        if options.json is not None:
+            check_writable(options.json)
         options.physics = replace(
             Physics(), friction=options.friction, everything=options.everything
         )
@@ -304,8 +318,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             run_stack(options, console)
     except SimulationError as error:
-        print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
+        print(f"python -m marl_pack.sapien_check: no verdict: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("python -m marl_pack.sapien_check: interrupted", file=sys.stderr)
+        return 130
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
         return 2

@@ -55,6 +55,7 @@ def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
     A box appears at its nominal place while those before it are where they have settled.
     """
     physics = replace(physics, everything=True)
+    stack = stack.scaled(1.0)  # in its own size, with masses that a solver can take
     frame = Frame(np.zeros((0, 3)), np.zeros((0, 4)), ())
     for count in range(1, len(stack) + 1):
         world = World(stack.first(count), physics, STEP)

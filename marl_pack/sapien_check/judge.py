@@ -7,8 +7,10 @@ can be trusted:
 - Only boxes in nominal vertical contact collide, with one another or with the floor. A neighbour or
   a wall that touches a box's side would prop it up by friction, or by the solver's tolerance, and
   hide a box that falls. (:attr:`Physics.everything` lets all of them collide, as in a real bin.)
-- A fall has to survive finer time steps: the solver leaves residues that let a box creep, and
-  these vanish with the step where a true fall does not (:attr:`Physics.passes`).
+- A fall has to survive finer time steps: the solver leaves residues that let a box creep, more so
+  where a heavy box stands on a light one, and these shrink with the step and the solver's
+  iterations where a true fall does not (:attr:`Physics.passes`, :attr:`Physics.heavy`).
+- All stacks are judged at one scale of length and mass (:func:`check`).
 - No sleeping, and more time where something creeps: a box at the tipping point begins slowly.
 
 The scene is made anew for every verdict, so a verdict depends on the stack alone.
@@ -18,22 +20,31 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import signal
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any, TypeVar
 
 import numpy as np
 
-from marl_pack.sapien_check.stack import SLACK, Floats, Stack
+from marl_pack.sapien_check.stack import SLACK, Floats, Stack, overlaps
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 GROUND_BIT = 31  # of the collision groups: the floor
 SAMPLE = 0.05  # seconds between looks at the boxes
 CREEP = 0.1  # share of a threshold from which on a box may be about to fall
-SHORTEST_SIDE = 0.01  # metres; below, the thresholds would be a large part of a box
-LONGEST_SIDE = 10.0  # metres; single precision resolves micrometres up to there
+LONGEST = 0.3  # metres; boxes are scaled so that their longest side is the paper's longest
+THINNEST = 1 / 50  # of the longest side: below, the thresholds would be a large part of a box
+HEAVY = 100.0  # ratio of masses from which on a fall has to survive Physics.heavy as well
+HEAVIEST = 1e4  # ratio of masses; beyond, the solver is no judge
 WALL = 0.05  # metres, thickness of the walls
 
 
@@ -49,14 +60,22 @@ class Pass:
 class Physics:
     """How it is simulated, and what counts as a fall."""
 
-    friction: float = 0.5  # static and dynamic
+    friction: float = 0.5  # static and dynamic, between all faces
     duration: float = 1.0  # seconds that a stack has to stand
     patience: float = 3.0  # the same where a box is past a tenth of a threshold by then
-    distance: float = 0.003  # metres that the middle of a box may move
+    distance: float = 0.003  # metres that the middle of a box may move, once scaled
     angle: float = 1.0  # degrees that a box may turn
-    contact_offset: float = 0.002  # metres from which on contacts are made
+    contact_offset: float = 0.002  # metres from which on contacts are made, once scaled
     passes: tuple[Pass, ...] = (Pass(1 / 240, 50), Pass(1 / 1000, 25), Pass(1 / 4000, 100))
+    heavy: Pass = Pass(1 / 16000, 200)  # one more where some boxes are far heavier than others
     everything: bool = False  # all boxes and the walls collide
+
+    def __post_init__(self) -> None:
+        numbers = (self.duration, self.patience, self.distance, self.angle, self.contact_offset)
+        if not self.passes or not all(0 < value < np.inf for value in numbers):
+            raise ValueError(f"{self}: needs a pass and positive numbers")
+        if not 0 <= self.friction < np.inf:
+            raise ValueError(f"friction = {self.friction}: needs a number, 0 or more")
 
 
 DEFAULT = Physics()
@@ -67,7 +86,7 @@ class Verdict:
     """What k boxes did after the last of them was placed."""
 
     stands: bool
-    distance: Floats  # [k]  metres that each box's middle moved, in the last pass
+    distance: Floats  # [k]  metres that each box's middle moved, in the last pass, unscaled
     angle: Floats  # [k]     degrees that each box turned
     moved: tuple[int, ...]  # boxes past a threshold; empty if the stack stands
     passes: int  # simulations it took
@@ -75,7 +94,7 @@ class Verdict:
 
 
 class SimulationError(RuntimeError):
-    """The simulation broke down, so there is no verdict."""
+    """There is no verdict: the simulation diverged, or the stack is beyond it."""
 
 
 @functools.cache
@@ -99,16 +118,21 @@ def load_sapien() -> Any:
 class World:
     """A bin with boxes at their nominal poses, and gravity.
 
+    SAPIEN keeps solver settings for the whole process and takes them when a system and its bodies
+    are made: a world changes them.
+
     Args:
         stack: the boxes.
         physics: friction, and what collides.
         step: time step and iterations.
+        groups: what :func:`collision_groups` gave, where it is at hand.
     """
 
-    def __init__(self, stack: Stack, physics: Physics, step: Pass) -> None:
+    def __init__(
+        self, stack: Stack, physics: Physics, step: Pass, groups: list[list[int]] | None = None
+    ) -> None:
         sapien = self.sapien = load_sapien()
         physx = sapien.physx
-        # SAPIEN takes these when a system and its bodies are made.
         physx.set_scene_config(enable_tgs=True, enable_pcm=True, enable_ccd=False)
         physx.set_body_config(
             solver_position_iterations=step.iterations, solver_velocity_iterations=1,
@@ -123,7 +147,7 @@ class World:
         self._fix((*stack.size[:2] / 2, -0.5), (*(stack.size[:2] / 2 + 1.0), 0.5))
         if physics.everything:
             self._add_walls(stack.size)
-        groups = collision_groups(stack, physics)
+        groups = collision_groups(stack, physics) if groups is None else groups
         self.bodies = [self._add_box(stack, i, groups[i]) for i in range(len(stack))]
 
     def _fix(self, middle: Sequence[float], half: Sequence[float]) -> None:
@@ -202,11 +226,15 @@ class World:
         distance = np.linalg.norm(middles - self.stack.middle, axis=1)
         return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
 
-    def moved(self) -> tuple[int, ...]:
-        """The boxes past a threshold."""
-        distance, angle = self.movement()
-        far = (distance > self.physics.distance) | (angle > self.physics.angle)
-        return tuple(np.flatnonzero(far).tolist())
+    def moved(self, share: float = 1.0) -> tuple[int, ...]:
+        """The boxes past a threshold, or a share of it."""
+        return past(*self.movement(), self.physics, share)
+
+
+def past(distance: Floats, angle: Floats, physics: Physics, share: float = 1) -> tuple[int, ...]:
+    """The boxes that have moved or turned by more than a share of the thresholds."""
+    far = (distance > share * physics.distance) | (angle > share * physics.angle)
+    return tuple(np.flatnonzero(far).tolist())
 
 
 def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
@@ -222,13 +250,12 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
         every = 1 | 1 << GROUND_BIT
         return [[every, every, 0, 0]] * n
     on = stack.rests_on()
-    near = 4 * (physics.distance + physics.contact_offset)
-    low, high = stack.low, stack.high
-    gap = np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None])
+    near = 2 * (physics.distance + physics.contact_offset)  # both may come closer
+    gap = -overlaps(stack.low, stack.high)
     stray = (gap < near).all(-1) & ~on  # [i, j]: i could come to touch j, but does not rest on it
     np.fill_diagonal(stray, False)
     # j and k may not share a bit if something on j could touch k without resting on it.
-    apart = (on.T.astype(np.int64) @ stray.astype(np.int64)) > 0
+    apart = (on.T.astype(np.float32) @ stray.astype(np.float32)) > 0
     apart |= apart.T
     bit = np.full(n, -1)
     for j in np.flatnonzero(on.any(0)):
@@ -240,7 +267,7 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     second = [0] * n
     for i, j in np.argwhere(on):
         second[i] |= first[j]
-    for i in np.flatnonzero(low[:, 2] < SLACK):
+    for i in np.flatnonzero(stack.low[:, 2] < SLACK):
         second[i] |= 1 << GROUND_BIT
     return [[a, b, 0, 0] for a, b in zip(first, second, strict=True)]
 
@@ -252,37 +279,50 @@ def check(stack: Stack, physics: Physics = DEFAULT) -> Verdict:
         stack: the boxes, the last one just placed.
         physics: how it is simulated.
 
+    Statics knows no scale: whether a stack stands does not change with the unit of length or of
+    mass, but the thresholds, the contacts and the numbers of a solver do. So all stacks are judged
+    at one scale, that of the paper's boxes.
+
     Raises:
-        ValueError: if a box is too small or the bin too large for the thresholds.
-        SimulationError: if the simulation diverges.
+        SimulationError: if the simulation diverges, or the boxes differ too much in size or mass.
     """
     if not len(stack):
         return Verdict(True, np.zeros(0), np.zeros(0), (), 0, 0.0)
-    if stack.sides.min() < SHORTEST_SIDE or stack.size.max() > LONGEST_SIDE:
-        raise ValueError(
-            f"sides from {stack.sides.min():g} m in a bin of up to {stack.size.max():g} m: the "
-            f"judge takes boxes from {SHORTEST_SIDE} m on in bins of up to {LONGEST_SIDE} m; "
-            "choose another cell size"
+    thinnest = float(stack.sides.min() / stack.sides.max())
+    if thinnest < THINNEST:
+        raise SimulationError(
+            f"the shortest side is {thinnest:.3g} of the longest; the judge needs {THINNEST:g}"
         )
-    verdict = _simulate(stack, physics, 1)
-    while not verdict.stands and verdict.passes < len(physics.passes):
-        verdict = _simulate(stack, physics, verdict.passes + 1)
-    return verdict
+    ratio = float(stack.mass.max() / stack.mass.min())
+    if ratio > HEAVIEST:
+        raise SimulationError(
+            f"the heaviest box weighs {ratio:.3g} times the lightest; the judge goes to "
+            f"{HEAVIEST:g}"
+        )
+    scale = LONGEST / float(stack.sides.max())
+    scaled = stack.scaled(scale)
+    groups = collision_groups(scaled, physics)
+    passes = [*physics.passes, physics.heavy] if ratio > HEAVY else physics.passes
+    for number, step in enumerate(passes, 1):
+        verdict = replace(_simulate(scaled, physics, step, groups), passes=number)
+        if verdict.stands:
+            break
+    return replace(verdict, distance=verdict.distance / scale)
 
 
-def _simulate(stack: Stack, physics: Physics, number: int) -> Verdict:
-    """The ``number``-th pass, ended as soon as a box has moved too far."""
-    world = World(stack, physics, physics.passes[number - 1])
+def _simulate(stack: Stack, physics: Physics, step: Pass, groups: list[list[int]]) -> Verdict:
+    """One pass, ended as soon as a box has moved too far."""
+    world = World(stack, physics, step, groups)
     seconds = 0.0
     while True:
         world.run(SAMPLE)
         seconds += SAMPLE
         distance, angle = world.movement()
-        moved = world.moved()
-        creeps = (distance > CREEP * physics.distance) | (angle > CREEP * physics.angle)
-        long = physics.patience if creeps.any() else physics.duration
+        moved = past(distance, angle, physics)
+        creeps = past(distance, angle, physics, CREEP)
+        long = physics.patience if creeps else physics.duration
         if moved or seconds > long - SAMPLE / 2:
-            return Verdict(not moved, distance, angle, moved, number, seconds)
+            return Verdict(not moved, distance, angle, moved, 1, seconds)
 
 
 def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
@@ -300,26 +340,55 @@ class Judged:
 
     placements: int  # judged: all, or up to and with the one that fell
     fall: Verdict | None  # the last verdict, if it was a fall
-    seconds: float  # simulated by wall clock, of this stack
+    seconds: float  # that the judging took
+    error: str | None = None  # why there is no verdict, of the placement after these
 
 
 def judge_whole(stack: Stack, physics: Physics = DEFAULT) -> Judged:
     """Judge a stack after each of its placements."""
     start = time.perf_counter()
-    verdicts = list(judge(stack, physics))
+    verdicts, error = [], None
+    try:
+        for verdict in judge(stack, physics):
+            verdicts.append(verdict)
+    except SimulationError as failed:
+        error = str(failed)
     fall = verdicts[-1] if verdicts and not verdicts[-1].stands else None
-    return Judged(len(verdicts), fall, time.perf_counter() - start)
+    return Judged(len(verdicts), fall, time.perf_counter() - start, error)
 
 
 def judge_all(
     stacks: Iterable[Stack], physics: Physics = DEFAULT, processes: int = 1
 ) -> Iterator[Judged]:
-    """Judge many stacks, in their order, by several processes."""
+    """Judge many stacks, in their order, by several processes.
+
+    With more than one the calling script needs the usual ``if __name__ == "__main__":``.
+    """
     task: Callable[[Stack], Judged] = functools.partial(judge_whole, physics=physics)
     if processes == 1:
         yield from map(task, stacks)
         return
-    # Not forked: torch and PhysX have threads.
+    yield from in_order(task, stacks, processes)
+
+
+def in_order(task: Callable[[T], R], given: Iterable[T], processes: int) -> Iterator[R]:
+    """``task`` of each that is given, in order, worked on a little ahead by several processes.
+
+    Raises:
+        SimulationError: if a process dies.
+    """
+    # Not forked: torch and PhysX have threads. Ctrl-C is for the process that waits.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        yield from pool.map(task, stacks, chunksize=4)
+    ignore = functools.partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    source = iter(given)
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=ignore) as pool:
+        waiting = deque(pool.submit(task, one) for one in islice(source, 2 * processes))
+        try:
+            while waiting:
+                done = waiting.popleft().result()
+                waiting.extend(pool.submit(task, one) for one in islice(source, 1))
+                yield done
+        except BrokenProcessPool as error:
+            raise SimulationError(f"a process that judges has died: {error}") from None
+        finally:
+            pool.shutdown(cancel_futures=True)

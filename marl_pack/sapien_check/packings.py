@@ -56,6 +56,8 @@ class Bodies:
             raise ValueError(
                 f"com_spread = {self.com_spread:g}: needs a fraction from 0 to below 0.5"
             )
+        if self.cell is not None and not 0 < self.cell < np.inf:
+            raise ValueError(f"cell = {self.cell:g}: needs a positive length in metres")
         if self.seed < 0:
             raise ValueError(f"seed = {self.seed}: needs 0 or more")
 
@@ -68,7 +70,7 @@ class Bodies:
         add("--density", nargs=2, type=float, metavar=("LOW", "HIGH"),
             help="density of each box, drawn between these, in kg/m³ "
                  "(default: as packed)")  # fmt: skip
-        add("--com-spread", type=float, default=0.0, metavar="SHARE",
+        add("--com-spread", type=float, metavar="SHARE",
             help="centre of mass of each box, drawn up to this share of each side off "
                  "(default: 0)")  # fmt: skip
 
@@ -76,14 +78,21 @@ class Bodies:
     def from_options(cls, options: argparse.Namespace) -> Bodies:
         """What a command's ``--cell``, ``--density``, ``--com-spread`` and ``--seed`` say."""
         density = None if options.density is None else (options.density[0], options.density[1])
-        return cls(options.cell, density, options.com_spread, options.seed)
+        return cls(options.cell, density, options.com_spread or 0.0, options.seed)
 
     def stacks(self, played: Packings, episodes: Iterable[int]) -> Iterator[Stack]:
         """The stacks of the chosen episodes."""
         return (self.stack(played, e) for e in episodes)
 
     def stack(self, played: Packings, episode: int) -> Stack:
-        """The stack of one episode. Weights are in cells of the standard density, or a file's."""
+        """The stack of one episode.
+
+        Weights are in cells of the standard density, or a file's. How high a centre of mass lies
+        in its box was not kept; it is put in the middle, which moves no tipping point.
+
+        Raises:
+            ValueError: naming the episode and the box, if the stack cannot be.
+        """
         n, size = int(played.packed[episode]), played.size
         boxes, loads = played.boxes[episode, :n], played.loads[episode, :n]
         sides = boxes[:, 3:].astype(np.float64)
@@ -95,6 +104,17 @@ class Bodies:
         offset = np.zeros((len(boxes), 3))
         offset[:, :2] = (loads[:, 1:] - boxes[:, :2]) / sides[:, :2] - 0.5
         offset += rng.uniform(-self.com_spread, self.com_spread, (len(boxes), 3))
-        return Stack.of_cells(
-            size, boxes, cell=cell, mass=drawn * volume * cell**3, com_offset=offset
-        )
+        mass = drawn * volume * cell**3
+        try:
+            return Stack.of_cells(size, boxes, cell=cell, mass=mass, com_offset=offset)
+        except ValueError as error:
+            raise ValueError(f"episode {episode}: {error}") from None
+
+    def __str__(self) -> str:
+        """In words, empty if all is as it was packed."""
+        said = []
+        if self.density is not None:
+            said.append(f"densities {self.density[0]:g} to {self.density[1]:g}")
+        if self.com_spread:
+            said.append(f"centres of mass up to {self.com_spread:g} off")
+        return ", ".join(said)

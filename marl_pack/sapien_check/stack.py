@@ -18,8 +18,8 @@ PAPER_BIN = 0.6
 """Edge of the paper's bin in metres (sec. IV-A)."""
 
 DENSITY = 500.0
-"""What the commands take for the density of a filled carton, kg/m³; verdicts under one density for
-all do not depend on it."""
+"""What the commands take for the density of a filled carton, kg/m³. Verdicts depend on the boxes'
+masses relative to one another alone."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class Stack:
                 box, or any number that is not finite.
         """
         given = np.asarray(boxes, np.float64)
+        if given.size == 0:
+            given = given.reshape(0, 6)
         if given.ndim != 2 or given.shape[1] != 6:
             raise ValueError(f"boxes: shape {given.shape}, needs [n, 6]: x, y, z, w, d, h")
         inner = np.asarray(size, np.float64)
@@ -78,10 +80,11 @@ class Stack:
         offset = _each(com_offset, len(given), (3,), "com_offset")
         inside = (np.abs(offset) < 0.5).all(1)  # false for NaN, too
         _refuse(~inside, offset, "needs a centre of mass inside the box")
-        if mass is None:
-            weights = weights * sides.prod(1)
+        with np.errstate(over="ignore"):
+            weights = weights * sides.prod(1) if mass is None else weights
         stack = cls(inner * cell, low, sides, weights, offset * sides)
         stack.check(given)
+        _refuse(~(np.isfinite(weights) & (weights > 0)), given, "its mass is not a number > 0")
         return stack
 
     def __len__(self) -> int:
@@ -97,8 +100,16 @@ class Stack:
         """Middle of each box, [n, 3]."""
         return self.low + self.sides / 2
 
+    def scaled(self, scale: float) -> Stack:
+        """The same stack with lengths times ``scale`` and a mean mass of 1 kg."""
+        lengths = (self.size, self.low, self.sides, self.com)
+        size, low, sides, com = (length * scale for length in lengths)
+        return Stack(size, low, sides, self.mass / self.mass.mean(), com)
+
     def first(self, count: int) -> Stack:
         """The stack as it was when ``count`` boxes had been placed."""
+        if not 0 <= count <= len(self):
+            raise ValueError(f"count = {count}: needs 0 … {len(self)}")
         arrays = {f.name: getattr(self, f.name)[:count] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
@@ -106,7 +117,7 @@ class Stack:
         """Bool [n, n]: whether box i touches box j from above, on more than an edge."""
         low, high = self.low, self.high
         meet = np.abs(low[:, None, 2] - high[None, :, 2]) < SLACK
-        return meet & (_overlaps(low, high)[..., :2] > SLACK).all(-1)
+        return meet & (overlaps(low, high)[..., :2] > SLACK).all(-1)
 
     def check(self, named: NDArray[np.floating[Any]] | None = None) -> None:
         """Refuse a stack that cannot be.
@@ -125,7 +136,7 @@ class Stack:
         _refuse((self.sides <= 0).any(1), rows, "needs sides longer than 0")
         out = (self.low < -SLACK) | (self.high > self.size + SLACK)
         _refuse(out.any(1), rows, "reaches out of the bin")
-        shared = np.tril((_overlaps(self.low, self.high) > SLACK).all(-1), -1)
+        shared = np.tril((overlaps(self.low, self.high) > SLACK).all(-1), -1)
         for i, j in np.argwhere(shared)[:1]:
             raise ValueError(f"{_name(i, rows)} overlaps {_name(j, rows)}")
         held = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < SLACK)
@@ -137,7 +148,7 @@ def cell_size(size: Sequence[float]) -> float:
     return PAPER_BIN / float(max(size))
 
 
-def _overlaps(low: Floats, high: Floats) -> Floats:
+def overlaps(low: Floats, high: Floats) -> Floats:
     """Length that boxes i and j share along each axis, [n, n, 3]; negative for a gap."""
     return np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
 

@@ -7,10 +7,8 @@ something has fallen.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import count
@@ -23,7 +21,7 @@ from torch import Tensor
 
 from marl_pack.bins import Bins
 from marl_pack.packing import Packing
-from marl_pack.sapien_check.judge import DEFAULT, Physics, check
+from marl_pack.sapien_check.judge import DEFAULT, Physics, check, in_order
 from marl_pack.sapien_check.stack import DENSITY, Stack
 from marl_pack.stability import Candidates, Rule, in_equilibrium, make_rule
 
@@ -142,30 +140,14 @@ def run(
     """
     bins: list[Bin] = []
     left = objects
-    for filled in _in_order(partial(fill, settings), processes):
+    task = partial(fill, settings)
+    for filled in map(task, count()) if processes == 1 else in_order(task, count(), processes):
         bins.append(filled.first(left))
         left -= len(bins[-1].placements)
         progress(len(bins[-1].placements))
         if not left:
             break
     return bins
-
-
-def _in_order(task: Callable[[int], Bin], processes: int) -> Iterator[Bin]:
-    """``task(0)``, ``task(1)``, … without end, worked on ahead by several processes."""
-    if processes == 1:
-        yield from map(task, count())
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        waiting: list[Future[Bin]] = [pool.submit(task, k) for k in range(2 * processes)]
-        try:
-            for k in count(2 * processes):
-                done = waiting.pop(0).result()
-                waiting.append(pool.submit(task, k))
-                yield done
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def summary(bins: list[Bin]) -> dict[str, Any]:
