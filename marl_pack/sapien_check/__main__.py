@@ -137,7 +137,7 @@ def run_controls(options: argparse.Namespace, console: Console) -> bool:
             bar.advance(task)
     table = Table(title="controls: + stands, - falls", box=box.SIMPLE, pad_edge=False)
     table.add_column("stack", no_wrap=True)
-    margins = " ".join(f"{m:+g}" for m in controls.MARGINS)
+    margins = ", ".join(f"{m:+g}" for m in controls.MARGINS)
     columns = ("known", "judge", "exact", "all meet", "flips, mm")
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
@@ -145,7 +145,7 @@ def run_controls(options: argparse.Namespace, console: Console) -> bool:
         own = [o for o in found if o.name == name]
 
         def signs(of: str, own: list[controls.Outcome] = own) -> str:
-            return " ".join("+" if getattr(o, of) else "-" for o in own)
+            return "".join("+" if getattr(o, of) else "-" for o in own)
 
         at = flips.get(name)
         flip = "" if at is None else "beyond 8" if math.isnan(at) else f"{at:+.3f}"

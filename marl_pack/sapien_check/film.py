@@ -38,6 +38,7 @@ STEP = Pass(1 / 1000, 50)
 ENDINGS = (".png", ".gif", ".mp4")
 PIXELS = (800, 800)
 FALLEN = "#d62728"
+COLOURS = [colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")]  # too red
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class View:
     def __init__(self, stack: Stack, title: str = "") -> None:
         self.plotter = pyvista.Plotter(off_screen=True, window_size=list(PIXELS))
         self.plotter.set_background("white")
-        self.plotter.enable_anti_aliasing("ssaa")
+        self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
         w, d, h = (float(s) for s in stack.size)
         room = pyvista.Box((0, w, 0, d, 0, h))
         self.plotter.add_mesh(room, style="wireframe", color="#707070", line_width=2)
@@ -101,7 +102,7 @@ class View:
         """A box and its edges, hidden, around its middle."""
         w, d, h = (float(s) for s in stack.sides[i])
         cube = pyvista.Cube(x_length=w, y_length=d, z_length=h)
-        colour = PALETTE[i % len(PALETTE)]
+        colour = COLOURS[i % len(COLOURS)]
         edges = cube.extract_feature_edges(30)
         actors = [
             self.plotter.add_mesh(cube, color=colour, ambient=0.35),
@@ -121,6 +122,7 @@ class View:
                     actor.user_matrix = _matrix(frame.middles[i], frame.turns[i])
             if i in frame.moved:
                 actors[0].prop.color = FALLEN
+        self.plotter.render()
         image: NDArray[np.uint8] = self.plotter.screenshot(return_img=True)
         return image
 
