@@ -13,7 +13,7 @@ FLOORS = (
     ("bins", "files", "item_files", "items", "render", "sapien_check"),
     ("stability",),
     ("packing",),
-    ("env_aec", "vec_env", "agents"),
+    ("env_aec", "vec_env", "agents", "integrations"),
     ("config", "evaluate", "export", "play", "train"),
 )
 

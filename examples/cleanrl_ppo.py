@@ -1,0 +1,124 @@
+"""CleanRL's style: PPO for both agents in one file, on the AEC environment as it is.
+
+Versions: needs nothing but marl_pack (and so PettingZoo and torch):
+    pip install . && python examples/cleanrl_ppo.py --items 100000
+
+The recipe, for any trainer of one's own:
+- A turn is a sample of the agent that acted. Its reward is what it got until its next turn (or the
+  end): PettingZoo's ``env.last()`` gives just that, summed since the agent last acted.
+- Each agent's advantages run over its own turns only.
+"""
+
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Categorical
+
+from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.network import ActorCritic
+from marl_pack.integrations.session import Counted, Session, run
+
+ITEMS, EPOCHS, MINIBATCH, RATE, CLIP, LAMBDA = 1024, 4, 128, 1e-3, 0.2, 0.95
+
+
+@dataclass
+class Turns:
+    """What one agent saw and did."""
+
+    planes: list[Tensor] = field(default_factory=list)
+    masks: list[Tensor] = field(default_factory=list)
+    actions: list[int] = field(default_factory=list)
+    log_probs: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    ends: list[bool] = field(default_factory=list)  # whether it was the agent's last turn
+
+    def advantages(self) -> Tensor:
+        """GAE with γ = 1 over the agent's own turns; the last turn is an episode's end."""
+        found, after, value = [], 0.0, 0.0
+        for k in reversed(range(len(self.actions))):
+            if self.ends[k]:
+                after, value = 0.0, 0.0
+            delta = self.rewards[k] + value - self.values[k]
+            after = delta + LAMBDA * after
+            value = self.values[k]
+            found.append(after)
+        return torch.tensor(found[::-1])
+
+
+def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) -> dict[str, Turns]:
+    """Play whole episodes until enough items have been placed."""
+    turns = {agent: Turns() for agent in AGENTS}
+    target = env.items + ITEMS
+    while env.items < target:
+        env.reset()
+        for agent in env.agent_iter():
+            seen, reward, terminated, truncated, _ = env.last()
+            own = turns[agent]
+            if own.actions and not own.ends[-1]:
+                own.rewards[-1] = reward
+                own.ends[-1] = terminated or truncated
+                session.credit(agent, reward)
+            if terminated or truncated:
+                env.step(None)
+                continue
+            planes = torch.from_numpy(seen["observation"])
+            mask = torch.from_numpy(seen["action_mask"])
+            with torch.no_grad():
+                logits, value = networks[agent](planes[None], mask[None])
+            choice = Categorical(logits=logits)
+            action = choice.sample()
+            own.planes.append(planes)
+            own.masks.append(mask)
+            own.actions.append(int(action))
+            own.log_probs.append(float(choice.log_prob(action)))
+            own.values.append(float(value))
+            own.rewards.append(0.0)
+            own.ends.append(False)
+            env.step(int(action))
+    return turns
+
+
+def learn(turns: Turns, network: ActorCritic, optimizer: torch.optim.Optimizer) -> None:
+    """PPO's epochs over one agent's turns."""
+    planes, masks = torch.stack(turns.planes), torch.stack(turns.masks)
+    actions, old = torch.tensor(turns.actions), torch.tensor(turns.log_probs)
+    advantages = turns.advantages()
+    returns = advantages + torch.tensor(turns.values)
+    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    for _ in range(EPOCHS):
+        for part in torch.randperm(len(actions)).split(MINIBATCH):
+            logits, values = network(planes[part], masks[part])
+            choice = Categorical(logits=logits)
+            ratio = (choice.log_prob(actions[part]) - old[part]).exp()
+            gain = torch.minimum(
+                ratio * advantages[part], ratio.clamp(1 - CLIP, 1 + CLIP) * advantages[part]
+            )
+            loss = -gain.mean() + 0.5 * (values - returns[part]).pow(2).mean()
+            loss -= 0.005 * choice.entropy().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+
+
+def train(session: Session) -> None:
+    """Train both agents."""
+    env = session.env()
+    env.reset(seed=session.seed)
+    networks = {agent: ActorCritic(agent.partition("_")[0]) for agent in AGENTS}
+    optimizers = {a: torch.optim.Adam(n.parameters(), RATE) for a, n in networks.items()}
+    session.watch(*networks.values())
+    while session.go_on():
+        turns = collect(env, networks, session)
+        for agent in AGENTS:
+            learn(turns[agent], networks[agent], optimizers[agent])
+        returns = np.sum(turns[AGENTS[1]].rewards) / np.sum(turns[AGENTS[1]].ends)
+        print(f"{session.placed:,} items, return {returns:.3f}")
+
+
+if __name__ == "__main__":
+    sys.exit(run("CleanRL's style", "marl_pack", train, description=__doc__))

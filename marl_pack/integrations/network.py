@@ -1,0 +1,66 @@
+"""A small actor-critic for the PettingZoo environment, in plain PyTorch.
+
+It sees what the environment shows (:mod:`marl_pack.env_aec`) and works for any bin size. The
+agents of ``marl_pack.train`` see more and are larger; this one is to be copied and changed.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+FORBIDDEN = -1e9
+"""Logit of an action that is not legal: finite, so that no entropy or KL becomes NaN."""
+
+
+class ActorCritic(nn.Module):
+    """Planes of one agent's turn, and its mask → logits of its actions, and the state's value.
+
+    Args:
+        agent: ``"orientation"`` scores six orientations, ``"placement"`` every cell;
+            ``"both"`` is for ``pad_actions=True``, where one network plays both turns.
+        channels: feature planes.
+    """
+
+    def __init__(self, agent: str, channels: int = 24) -> None:
+        super().__init__()
+        if agent not in ("orientation", "placement", "both"):
+            raise ValueError(f"agent {agent!r}: one of orientation, placement, both")
+        self.agent = agent
+        planes = {"orientation": 4, "placement": 5, "both": 6}[agent]
+        self.trunk = nn.Sequential(
+            nn.Conv2d(planes, channels, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
+        )  # fmt: skip
+        self.turns = nn.Linear(2 * channels, 6)
+        self.cells = nn.Conv2d(channels, 1, 1)
+        self.critic = nn.Sequential(
+            nn.Linear(2 * channels, 64), nn.ReLU(), nn.Linear(64, 1)
+        )  # fmt: skip
+
+    def forward(self, planes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Masked logits [B, n] and values [B].
+
+        Args:
+            planes: float [B, 4, W, D], or [B, 5, W, D] with ``pad_actions=True``.
+            mask: [B, n], nonzero where an action is legal.
+        """
+        legal = mask.bool()
+        batch, _, width, depth = planes.shape
+        if self.agent != "orientation":  # where the item may go is the best there is to see
+            spots = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
+            if self.agent == "both":
+                spots = spots * planes[:, 4:]  # in the orientation's turn the mask has no cells
+            planes = torch.cat((planes, spots), 1)
+        features = self.trunk(planes)
+        pooled = torch.cat((features.mean((2, 3)), features.amax((2, 3))), 1)
+        if self.agent == "orientation":
+            logits = self.turns(pooled)
+        else:
+            logits = self.cells(features).flatten(1)
+            if self.agent == "both":
+                logits = nn.functional.pad(logits, (0, mask.shape[1] - width * depth))
+                turn = nn.functional.pad(self.turns(pooled), (0, mask.shape[1] - 6))
+                logits = torch.where(planes[:, 4, 0, 0, None] > 0, logits, turn)
+        return logits.masked_fill(~legal, FORBIDDEN), self.critic(pooled).squeeze(1)

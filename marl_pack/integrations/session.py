@@ -1,0 +1,209 @@
+"""An example's command line, and the account of what its trainer did with the environment.
+
+A trainer fits if it plays no illegal action, changes the weights of both agents, and credits both
+with the environment's rewards. :class:`Session` sees to all three from outside: it wraps the
+environment, keeps the weights from before, and plays held-out sequences before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pettingzoo.utils.wrappers import BaseWrapper
+
+from marl_pack import env_aec
+from marl_pack.env_aec import AGENTS
+from marl_pack.files import write_atomically
+from marl_pack.integrations.network import ActorCritic
+
+HELD_OUT = 10**9
+"""Seed of the sequences that are played before and after; training has smaller ones."""
+
+
+class Counted(BaseWrapper):
+    """The environment, with what is done in it counted.
+
+    Attributes:
+        items: items placed.
+        illegal: actions played against the mask.
+        totals: agent -> sum of its rewards.
+    """
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.items, self.illegal = 0, 0
+        self.totals = dict.fromkeys(AGENTS, 0.0)
+
+    def step(self, action: Any) -> None:
+        """Play the action."""
+        agent = self.env.agent_selection
+        played = not (self.env.terminations[agent] or self.env.truncations[agent])
+        if played:
+            raw = self.env.unwrapped
+            self.illegal += not raw.action_mask(agent)[int(action)]
+            self.items += agent == AGENTS[1]
+        super().step(action)
+        if played:
+            for name, reward in self.env.rewards.items():
+                self.totals[name] += float(reward)
+
+
+class Session:
+    """One run of an example.
+
+    Attributes:
+        items: how many items to train on, about.
+        bin_size: W, D, H in cells.
+        seed: of weights and items.
+
+    Args:
+        arguments: of the command line.
+        description: what ``--help`` says.
+    """
+
+    def __init__(self, arguments: Sequence[str] | None = None, description: str = "") -> None:
+        options = argparse.ArgumentParser(description=description)
+        add = options.add_argument
+        add("--items", type=int, default=100_000, help="to train on (default: 100,000)")
+        add("--minutes", type=float, help="end after so long, whatever is left")
+        add("--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
+            help="bin size in cells (default: 10 10 10)")  # fmt: skip
+        add("--sides", type=int, nargs=2, default=(2, 5), metavar=("SHORTEST", "LONGEST"),
+            help="sides of the items (default: 2 5)")  # fmt: skip
+        add("--episodes", type=int, default=100,
+            help="held-out sequences played before and after (default: 100)")  # fmt: skip
+        add("--seed", type=int, default=0, help="of weights and items (default: 0)")
+        add("--json", type=Path, metavar="FILE", help="write the account there")
+        chosen = options.parse_args(arguments)
+        self.items, self.seed, self.episodes = chosen.items, chosen.seed, chosen.episodes
+        self.bin_size, self.sides = tuple(chosen.bin), tuple(chosen.sides)
+        self.json: Path | None = chosen.json
+        self.end = time.monotonic() + 60 * (chosen.minutes or float("inf"))
+        self.start = time.monotonic()
+        self.envs: list[Counted] = []
+        self.credited = dict.fromkeys(AGENTS, 0.0)
+        torch.set_num_threads(1)
+        torch.manual_seed(chosen.seed)
+
+    def env(self, **options: Any) -> Counted:
+        """A new AEC environment (:func:`marl_pack.env_aec.env`), counted."""
+        made = Counted(env_aec.env(bin_size=self.bin_size, sides=self.sides, **options))
+        self.envs.append(made)
+        return made
+
+    def parallel_env(self, **options: Any) -> env_aec.Turns:
+        """The same, turn by turn, as :func:`marl_pack.env_aec.parallel_env` gives it."""
+        return env_aec.Turns(self.env(**options))
+
+    def go_on(self) -> bool:
+        """Whether there is something left to train on."""
+        return self.placed < self.items and time.monotonic() < self.end
+
+    @property
+    def placed(self) -> int:
+        """Items placed in all environments."""
+        return sum(env.items for env in self.envs)
+
+    def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
+        """Name the networks that will learn (twice the same, if one plays both turns)."""
+        self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
+        self.before = {
+            name: [p.detach().clone() for p in network.parameters()]
+            for name, network in self.networks.items()
+        }
+        self.utilization_before = self.play()
+
+    def credit(self, agent: str, reward: float) -> None:
+        """Say what reward the trainer has put down for an agent."""
+        self.credited[agent] += float(reward)
+
+    @torch.no_grad()
+    def play(self) -> float:
+        """Mean utilization over held-out sequences, each agent taking its best action."""
+        both = self.networks[AGENTS[0]].agent == "both"
+        env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
+        reached = []
+        for episode in range(self.episodes):
+            env.reset(seed=HELD_OUT if episode == 0 else None)
+            for agent in env.agent_iter():
+                seen, _, terminated, truncated, info = env.last()
+                if terminated or truncated:
+                    reached.append(info["utilization"])
+                    break
+                planes, mask = (torch.as_tensor(np.asarray(seen[k]))[None]
+                                for k in ("observation", "action_mask"))  # fmt: skip
+                env.step(int(self.networks[agent](planes, mask)[0].argmax()))
+        return float(np.mean(reached))
+
+    def account(self, trainer: str, package: str) -> dict[str, Any]:
+        """What came of it."""
+        env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
+        updated = {
+            a: any(not torch.equal(old, new) for old, new in
+                   zip(self.before[a], self.networks[a].parameters(), strict=True))
+            for a in AGENTS
+        }  # fmt: skip
+        right = {
+            a: abs(env_rewards[a] - self.credited[a]) <= 1e-4 * max(1.0, abs(env_rewards[a]))
+            for a in AGENTS
+        }
+        return {
+            "trainer": trainer,
+            "version": metadata.version(package),
+            "bin": self.bin_size,
+            "items": self.placed,
+            "minutes": (time.monotonic() - self.start) / 60,
+            "illegal": sum(env.illegal for env in self.envs),
+            "updated": updated,
+            "rewards_right": right,
+            "rewards": env_rewards,
+            "credited": self.credited,
+            "before": self.utilization_before,
+            "after": self.play(),
+        }
+
+
+_running: list[Session] = []
+
+
+def current() -> Session:
+    """The session that runs: for trainers that make environments from a pickled function."""
+    return _running[-1]
+
+
+def run(
+    trainer: str,
+    package: str,
+    train: Callable[[Session], None],
+    arguments: Sequence[str] | None = None,
+    description: str = "",
+) -> int:
+    """Run an example and print its account.
+
+    Returns:
+        The exit status: 0 if no action was illegal, both agents learned and were credited right.
+    """
+    session = Session(arguments, description)
+    _running.append(session)
+    train(session)
+    found = session.account(trainer, package)
+    for key, value in found.items():
+        shown = f"{100 * value:.2f} %" if key in ("before", "after") else value
+        print(f"{key}: {shown}")
+    if session.json is not None:
+        text = json.dumps(found, indent=2) + "\n"
+        write_atomically(session.json, lambda file: file.write(text.encode()))
+    fits = not found["illegal"] and all(
+        (*found["updated"].values(), *found["rewards_right"].values())
+    )
+    print("fits" if fits else "DOES NOT FIT", file=sys.stderr if not fits else sys.stdout)
+    return 0 if fits else 1
