@@ -179,6 +179,7 @@ class Runner(OnPolicyRunner):
             return
         state = self._gather(self.state())
         if self.gpu_global_rank == 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
             checkpoint.write(self.folder / checkpoint.LATEST, self.checkpoint() | {"state": state})
 
     def _evaluate(self, progress: Progress) -> None:
