@@ -33,7 +33,7 @@ FLAT = (0, 0, 0, 4, 4, 2)
 
 
 def stack(*boxes: tuple[float, ...], **named: object) -> Stack:
-    return Stack.of_cells(BIN, boxes, **{"density": 500.0, **named})  # type: ignore[arg-type]
+    return Stack.of_cells(BIN, boxes, **{"density": 500.0, **named})  # type: ignore[arg-type]  # bad ones, too
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -278,7 +278,7 @@ def test_bodies_are_drawn_within_their_bounds_and_the_same_again(tmp_path: Path)
 ])  # fmt: skip
 def test_bodies_that_cannot_be_are_refused(named: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="needs"):
-        Bodies(**named)  # type: ignore[arg-type]
+        Bodies(**named)  # type: ignore[arg-type]  # bad ones are meant
 
 
 def test_evaluate_tells_falls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
