@@ -9,7 +9,6 @@ linear program that shares no code with the masks.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -29,7 +28,7 @@ from scipy import stats
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
-from marl_pack.files import check_writable, write_atomically
+from marl_pack.files import check_writable, write_atomically, write_json
 from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
@@ -450,8 +449,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
         report = {"settings": settings | {"bin": size, "episodes": episodes}, "policies": rows}
-        text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
-        write_atomically(arguments.json, lambda file: file.write(text.encode()))
+        write_json(arguments.json, report)
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,3 +37,9 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
         write(file)
         file.flush()
         os.fsync(file.fileno())
+
+
+def write_json(path: Path, report: Any) -> None:
+    """Write figures as JSON; what it does not know is written as text, NaN is refused."""
+    text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))

@@ -8,7 +8,6 @@ environment, keeps the weights from before, and plays held-out sequences before 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from pettingzoo.utils.wrappers import BaseWrapper
 
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
-from marl_pack.files import write_atomically
+from marl_pack.files import write_json
 from marl_pack.integrations.network import ActorCritic
 
 HELD_OUT = 10**9
@@ -100,10 +99,6 @@ class Session:
         self.envs.append(made)
         return made
 
-    def parallel_env(self, **options: Any) -> env_aec.Turns:
-        """The same, turn by turn, as :func:`marl_pack.env_aec.parallel_env` gives it."""
-        return env_aec.Turns(self.env(**options))
-
     def go_on(self) -> bool:
         """Whether there is something left to train on."""
         return self.placed < self.items and time.monotonic() < self.end
@@ -172,14 +167,6 @@ class Session:
         }
 
 
-_running: list[Session] = []
-
-
-def current() -> Session:
-    """The session that runs: for trainers that make environments from a pickled function."""
-    return _running[-1]
-
-
 def run(
     trainer: str,
     package: str,
@@ -193,15 +180,13 @@ def run(
         The exit status: 0 if no action was illegal, both agents learned and were credited right.
     """
     session = Session(arguments, description)
-    _running.append(session)
     train(session)
     found = session.account(trainer, package)
     for key, value in found.items():
         shown = f"{100 * value:.2f} %" if key in ("before", "after") else value
         print(f"{key}: {shown}")
     if session.json is not None:
-        text = json.dumps(found, indent=2) + "\n"
-        write_atomically(session.json, lambda file: file.write(text.encode()))
+        write_json(session.json, found)
     fits = not found["illegal"] and all(
         (*found["updated"].values(), *found["rewards_right"].values())
     )

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -18,7 +17,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import (
@@ -31,8 +29,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from marl_pack.evaluate import Episodes, load_stacks
-from marl_pack.files import check_writable, write_atomically
+from marl_pack.evaluate import Episodes, load_stacks, save_stacks
+from marl_pack.files import check_writable, write_json
 from marl_pack.sapien_check import controls, table1
 from marl_pack.sapien_check.judge import DEFAULT, Physics, SimulationError, Verdict, judge_all
 from marl_pack.sapien_check.packings import Bodies
@@ -44,12 +42,6 @@ def _progress(console: Console) -> Progress:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TimeRemainingColumn(), console=console, transient=True,
     )  # fmt: skip
-
-
-def _write_json(path: Path | None, report: dict[str, Any]) -> None:
-    if path is not None:
-        text = json.dumps(report, indent=2, allow_nan=False, default=str) + "\n"
-        write_atomically(path, lambda file: file.write(text.encode()))
 
 
 # --- table1 ---------------------------------------------------------------------------------------
@@ -66,7 +58,7 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
             check_writable(falls_file(options.save_falls, rule))
     with _progress(console) as bar:
         for rule in rules:
-            settings = table1.Settings(rule, None, options.seed, options.physics)
+            settings = table1.Settings(rule, options.seed, options.physics)
             task = bar.add_task(f"{rule}: objects", total=options.objects)
             bins = table1.run(
                 settings, options.objects, options.processes,
@@ -75,12 +67,12 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
             rows[rule] = table1.summary(bins)
             if options.save_falls and rows[rule]["falls"]:
                 path = falls_file(options.save_falls, rule)
-                kept = table1.stacks(bins)
-                write_atomically(path, lambda file, kept=kept: np.savez_compressed(file, **kept))  # type: ignore[misc]  # likewise
+                save_stacks(path, table1.fallen(bins))
                 console.print(f"{path}: the bins in which something fell", soft_wrap=True)
     show_table1(rows, console, f"Table 1, {options.objects:,} objects a rule, seed {options.seed}")
     report = {"objects": options.objects, "seed": options.seed, "physics": asdict(options.physics)}
-    _write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
+    if options.json is not None:
+        write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
 
 
 def falls_file(path: Path, rule: str) -> Path:
@@ -165,7 +157,8 @@ def run_controls(options: argparse.Namespace, console: Console) -> bool:
         "flips_at_mm": {name: None if math.isnan(at) else at for name, at in flips.items()},
         "physics": asdict(options.physics),
     }
-    _write_json(options.json, report)
+    if options.json is not None:
+        write_json(options.json, report)
     return right["judge"] == len(found)
 
 
@@ -217,7 +210,8 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
         ],
         "errors": errors,
     }  # fmt: skip
-    _write_json(options.json, report)
+    if options.json is not None:
+        write_json(options.json, report)
 
 
 def told(fall: Verdict) -> str:

@@ -226,9 +226,9 @@ class World:
         distance = np.linalg.norm(middles - self.stack.middle, axis=1)
         return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
 
-    def moved(self, share: float = 1.0) -> tuple[int, ...]:
-        """The boxes past a threshold, or a share of it."""
-        return past(*self.movement(), self.physics, share)
+    def moved(self) -> tuple[int, ...]:
+        """The boxes past a threshold."""
+        return past(*self.movement(), self.physics)
 
 
 def past(distance: Floats, angle: Floats, physics: Physics, share: float = 1) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_pack.bins import Bins
+from marl_pack.evaluate import Episodes
 from marl_pack.packing import Packing
 from marl_pack.sapien_check.judge import DEFAULT, Physics, check, in_order
 from marl_pack.sapien_check.stack import DENSITY, Stack
@@ -40,7 +41,6 @@ class Settings:
     """What is tried."""
 
     rule: str
-    margin: float | None = None  # cells
     seed: int = 0
     physics: Physics = DEFAULT
 
@@ -86,13 +86,7 @@ class Timed:
 @cache
 def _compile(settings: Settings) -> None:
     """Have the rule compiled, so that no mask's time counts it."""
-    list(_play(settings, -1, Timed(_rule(settings))))
-
-
-def _rule(settings: Settings) -> Rule:
-    return make_rule(
-        settings.rule, **({} if settings.margin is None else {"margin": settings.margin})
-    )
+    list(_play(settings, -1, Timed(make_rule(settings.rule))))
 
 
 def _play(settings: Settings, number: int, rule: Timed) -> Iterator[Packing]:
@@ -112,7 +106,7 @@ def fill(settings: Settings, number: int) -> Bin:
     """Play bin ``number`` to its end, judging after every placement."""
     torch.set_num_threads(1)
     _compile(settings)
-    rule = Timed(_rule(settings))
+    rule = Timed(make_rule(settings.rule))
     placements: list[Placement] = []
     for game in _play(settings, number, rule):
         n = int(game.bins.count)
@@ -171,18 +165,13 @@ def summary(bins: list[Bin]) -> dict[str, Any]:
     }
 
 
-def stacks(bins: list[Bin]) -> dict[str, NDArray[Any]]:
-    """The bins in which something fell, as ``evaluate --save-stacks`` keeps stacks."""
+def fallen(bins: list[Bin]) -> Episodes:
+    """The bins in which something fell, as packings."""
     fell = [filled for filled in bins if not filled.placements[-1].stands]
-    most = max((len(filled.placements) for filled in fell), default=1)
-    boxes = np.zeros((len(fell), most, 6), np.int16)
-    loads = np.zeros((len(fell), most, 3))
+    count = np.array([len(filled.boxes) for filled in fell], np.int64)
+    boxes = np.zeros((len(fell), count.max(initial=1), 6), np.int16)
+    loads = np.zeros((*boxes.shape[:2], 3))
     for e, filled in enumerate(fell):
-        boxes[e, : len(filled.boxes)], loads[e, : len(filled.loads)] = filled.boxes, filled.loads
-    return {
-        "bin": np.array(SIZE),
-        "count": np.array([len(filled.boxes) for filled in fell], np.int64),
-        "boxes": boxes,
-        "loads": loads,
-        "utilization": boxes[..., 3:].astype(np.int64).prod(2).sum(1) / np.prod(SIZE),
-    }
+        boxes[e, : count[e]], loads[e, : count[e]] = filled.boxes, filled.loads
+    filled_share = boxes[..., 3:].astype(np.int64).prod(2).sum(1) / np.prod(SIZE)
+    return Episodes(SIZE, filled_share, count, boxes, loads, float("nan"))
