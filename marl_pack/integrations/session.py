@@ -99,6 +99,10 @@ class Session:
         self.envs.append(made)
         return made
 
+    def parallel_env(self, **options: Any) -> env_aec.Turns:
+        """The same, turn by turn, as :func:`marl_pack.env_aec.parallel_env` gives it."""
+        return env_aec.Turns(self.env(**options))
+
     def go_on(self) -> bool:
         """Whether there is something left to train on."""
         return self.placed < self.items and time.monotonic() < self.end
@@ -167,6 +171,14 @@ class Session:
         }
 
 
+_running: list[Session] = []
+
+
+def current() -> Session:
+    """The session that runs, for trainers that make environments from a pickled function."""
+    return _running[-1]
+
+
 def run(
     trainer: str,
     package: str,
@@ -180,6 +192,7 @@ def run(
         The exit status: 0 if no action was illegal, both agents learned and were credited right.
     """
     session = Session(arguments, description)
+    _running.append(session)
     train(session)
     found = session.account(trainer, package)
     for key, value in found.items():

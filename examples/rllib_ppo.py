@@ -1,0 +1,98 @@
+"""RLlib, new API stack: PPO with a policy for each agent, on the AEC environment as it is.
+
+Versions: ray 2.60:
+    pip install "ray[rllib]==2.60.*" . && python examples/rllib_ppo.py --items 100000
+
+Traps:
+- Masks are the RLModule's business: :class:`MaskedModule` reads them from the observation. Its
+  `ValueFunctionAPI` is what the connectors ask for values with.
+- Ray makes the environments from a pickled function, so what it closes over is a copy. Here all
+  runs in one process (`num_env_runners=0`) and the function looks the session up.
+- The default `vf_clip_param` of 10 and the KL penalty are off: returns are below 1.
+- Use `batch_mode="complete_episodes"`: a cut between the two agents' turns leaves one of them
+  without its reward.
+"""
+
+import sys
+from typing import Any
+
+import torch
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env.wrappers.pettingzoo_env import PettingZooEnv
+from ray.tune.registry import register_env
+
+from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.network import ActorCritic
+from marl_pack.integrations.session import Session, current, run
+
+
+class MaskedModule(TorchRLModule, ValueFunctionAPI):
+    """An :class:`ActorCritic` as RLlib wants it; ``model_config={"agent": "orientation"}``."""
+
+    def setup(self) -> None:
+        """Make the network."""
+        self.network = ActorCritic(self.model_config["agent"])
+
+    def _look(self, batch: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = batch[Columns.OBS]
+        return self.network(seen["observation"], seen["action_mask"])
+
+    def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, torch.Tensor]:
+        return {Columns.ACTION_DIST_INPUTS: self._look(batch)[0]}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> torch.Tensor:
+        """Values [B]."""
+        return self._look(batch)[1]
+
+
+def credit(*, samples: list[Any], **_: Any) -> None:
+    """Tell the session what RLlib has put down for the agents."""
+    for episode in samples:
+        for agent, own in episode.agent_episodes.items():
+            current().credit(agent, sum(own.get_rewards()))
+
+
+def train(session: Session) -> None:
+    """Train both agents."""
+    register_env("packing", lambda _: PettingZooEnv(current().env()))
+    config = (
+        PPOConfig()
+        .environment("packing")
+        .framework("torch")
+        .env_runners(num_env_runners=0, batch_mode="complete_episodes")
+        .learners(num_learners=0)
+        .multi_agent(policies=set(AGENTS), policy_mapping_fn=lambda agent, *_, **__: agent)
+        .rl_module(
+            rl_module_spec=MultiRLModuleSpec(
+                rl_module_specs={
+                    agent: RLModuleSpec(
+                        MaskedModule, model_config={"agent": agent.partition("_")[0]}
+                    )
+                    for agent in AGENTS
+                }
+            )
+        )
+        .training(
+            gamma=1.0, lambda_=0.95, lr=1e-3, train_batch_size_per_learner=2048,
+            minibatch_size=128, num_epochs=4, entropy_coeff=0.005, use_kl_loss=False,
+            vf_clip_param=float("inf"), vf_loss_coeff=0.5, clip_param=0.2, grad_clip=1.0,
+        )
+        .callbacks(on_sample_end=credit)
+        .debugging(seed=session.seed, log_level="ERROR")
+    )  # fmt: skip
+    algorithm = config.build_algo()
+    session.watch(*(algorithm.get_module(agent).network for agent in AGENTS))
+    while session.go_on():
+        found = algorithm.train()
+        reached = found["env_runners"]["agent_episode_returns_mean"][AGENTS[1]]
+        print(f"{session.placed:,} items, return {reached:.3f}")
+    algorithm.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(run("RLlib", "ray", train, description=__doc__))

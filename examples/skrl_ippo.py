@@ -1,0 +1,111 @@
+"""skrl: IPPO for both agents, on the environment's parallel view, turn by turn.
+
+Versions: skrl 2.1:
+    pip install "skrl==2.1.*" . && python examples/skrl_ippo.py --items 100000
+
+Traps:
+- skrl takes PettingZoo's parallel API alone. `env_aec.parallel_env()` is turn-based, so its masks
+  are exact; a conversion in which both act at once would show the placement agent a stale mask.
+- skrl knows no masks: the model has to apply them, as :class:`Masked` does.
+- Both agents record every turn. In the other's turn nothing is legal, so all logits are equal and
+  constant: no gradient reaches the policy from there, and the critic learns one more state's value.
+- The settings' empty dictionaries are refused (2.1): each has to name the agents.
+- The wrapper calls `state()` after each step, so the environment has to have it.
+"""
+
+import sys
+from typing import Any
+
+from skrl import config
+from skrl.envs.wrappers.torch import wrap_env
+from skrl.memories.torch import RandomMemory
+from skrl.models.torch import CategoricalMixin, DeterministicMixin, Model
+from skrl.multi_agents.torch.ippo import IPPO, IPPO_CFG
+from skrl.trainers.torch import SequentialTrainer, SequentialTrainerCfg
+from skrl.utils.spaces.torch import unflatten_tensorized_space
+
+from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.network import ActorCritic
+from marl_pack.integrations.session import Session, run
+
+TURNS = 2048
+
+
+class Masked(CategoricalMixin, DeterministicMixin, Model):
+    """An :class:`ActorCritic` as skrl wants it: policy and value in one."""
+
+    def __init__(self, agent: str, **spaces: Any) -> None:
+        Model.__init__(self, **spaces)
+        CategoricalMixin.__init__(self, role="policy")
+        DeterministicMixin.__init__(self, role="value")
+        self.network = ActorCritic(agent.partition("_")[0])
+
+    def act(self, inputs: dict[str, Any], *, role: str = "") -> Any:
+        """As the mixin of the role does."""
+        mixin = CategoricalMixin if role == "policy" else DeterministicMixin
+        return mixin.act(self, inputs, role=role)
+
+    def compute(self, inputs: dict[str, Any], role: str = "") -> Any:
+        """Masked logits [B, n], or values [B, 1]."""
+        seen = unflatten_tensorized_space(self.observation_space, inputs["observations"])
+        logits, values = self.network(seen["observation"], seen["action_mask"])
+        return (logits if role == "policy" else values[:, None]), {}
+
+
+class Credited(IPPO):
+    """Tells the session what skrl puts down for the agents."""
+
+    session: Session
+
+    def record_transition(self, **transition: Any) -> None:
+        """Record a turn."""
+        for agent, reward in transition["rewards"].items():
+            self.session.credit(agent, reward)
+        super().record_transition(**transition)
+
+
+def train(session: Session) -> None:
+    """Train both agents."""
+    config.torch.key = session.seed  # of the items: the wrapper's first reset takes it
+    env = wrap_env(session.parallel_env(), wrapper="pettingzoo")
+    spaces = {
+        agent: {
+            "observation_space": env.observation_space(agent),
+            "state_space": env.state_space(agent),
+            "action_space": env.action_space(agent),
+        }
+        for agent in AGENTS
+    }
+    models = {agent: Masked(agent, **spaces[agent]) for agent in AGENTS}
+    none: dict[str, Any] = {agent: {} for agent in AGENTS}
+    both = Credited(
+        possible_agents=AGENTS,
+        models={agent: {"policy": model, "value": model} for agent, model in models.items()},
+        memories={agent: RandomMemory(memory_size=TURNS) for agent in AGENTS},
+        observation_spaces=env.observation_spaces,
+        state_spaces=env.state_spaces,
+        action_spaces=env.action_spaces,
+        cfg=IPPO_CFG(
+            rollouts=TURNS, learning_epochs=4, mini_batches=16, discount_factor=1.0,
+            gae_lambda=0.95, learning_rate=1e-3, grad_norm_clip=1.0, value_clip=0.0,
+            value_loss_scale=0.5, entropy_loss_scale=0.005,
+            experiment={"write_interval": 0, "checkpoint_interval": 0},
+            learning_rate_scheduler_kwargs=none, observation_preprocessor_kwargs=none,
+            state_preprocessor_kwargs=none, value_preprocessor_kwargs=none,
+        ),
+    )  # fmt: skip
+    both.session = session
+    session.watch(*(models[agent].network for agent in AGENTS))
+    # A call of train() is one rollout and one update; it begins with a new episode.
+    settings = SequentialTrainerCfg(
+        timesteps=TURNS, headless=True, disable_progressbar=True, close_environment_at_exit=False
+    )
+    trainer = SequentialTrainer(env=env, agents=both, cfg=settings)
+    while session.go_on():
+        trainer.train()
+        rewards = both.memories[AGENTS[1]].get_tensor_by_name("rewards")
+        print(f"{session.placed:,} items, reward an item {2 * rewards.mean():.4f}")
+
+
+if __name__ == "__main__":
+    sys.exit(run("skrl", "skrl", train, description=__doc__))

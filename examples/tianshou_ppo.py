@@ -1,0 +1,121 @@
+"""Tianshou: a PPO for each agent, on the AEC environment with padded spaces.
+
+Versions: tianshou 2.0:
+    pip install "tianshou==2.0.*" . && python examples/tianshou_ppo.py --items 100000
+
+Traps:
+- Its PettingZoo wrapper wants one space for all agents: `pad_actions=True`.
+- Its multi-agent PPO takes every turn as a step of its own (its issue 399): the reward of a
+  placement, which both agents get, would go to the placement agent alone, the orientation agent
+  would see nothing but zeros and no end of an episode, and both would be valued by what the *other*
+  one sees next. :class:`Turns` gives each agent its own turns in a row instead.
+- The collector has to play whole episodes, so that every turn has what followed.
+"""
+
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+from tianshou.algorithm import PPO
+from tianshou.algorithm.modelfree.reinforce import DiscreteActorPolicy
+from tianshou.algorithm.multiagent.marl import MultiAgentOnPolicyAlgorithm
+from tianshou.algorithm.optim import AdamOptimizerFactory
+from tianshou.data import Batch, Collector, ReplayBuffer, VectorReplayBuffer
+from tianshou.env import DummyVectorEnv, PettingZooEnv
+from tianshou.utils.net.common import ActionReprNet
+from tianshou.utils.torch_utils import policy_within_training_step
+from torch import nn
+
+from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.network import ActorCritic
+from marl_pack.integrations.session import Session, run
+
+BINS, EPISODES, EPOCHS, MINIBATCH, RATE = 8, 64, 4, 128, 1e-3
+
+
+def look(network: ActorCritic, seen: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Logits and values of what Tianshou hands on."""
+    return network(torch.as_tensor(seen.obs), torch.as_tensor(seen.mask))
+
+
+class Actor(ActionReprNet):
+    """The network's logits."""
+
+    def __init__(self, network: ActorCritic) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, obs: Batch, state: Any = None, info: Any = None) -> tuple[torch.Tensor, Any]:
+        """Logits [B, n]."""
+        return look(self.network, obs)[0], state
+
+
+class Critic(nn.Module):
+    """The network's values."""
+
+    def __init__(self, network: ActorCritic) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, obs: Batch) -> torch.Tensor:
+        """Values [B]."""
+        return look(self.network, obs)[1]
+
+
+class Turns(MultiAgentOnPolicyAlgorithm):
+    """Each agent's turns as a run of its own, with all that it got until its next one."""
+
+    def __init__(self, session: Session, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self.session = session
+
+    def _preprocess_batch(self, batch: Any, buffer: Any, indices: Any) -> Any:
+        found = {}
+        for column, agent in enumerate(AGENTS):
+            own = np.flatnonzero(batch.obs.agent_id == agent)
+            other = np.minimum(own + 1, len(batch.done) - 1)  # the turn after it, if there is one
+            goes_on = ~batch.done[own] & (other > own)
+            rewards = batch.rew[own, column] + np.where(goes_on, batch.rew[other, column], 0)
+            self.session.credit(agent, rewards.sum())
+            turns = ReplayBuffer.from_data(
+                obs=batch.obs[own], act=batch.act[own], rew=rewards,
+                terminated=batch.terminated[own] | (goes_on & batch.terminated[other]),
+                truncated=batch.truncated[own] | (goes_on & batch.truncated[other]),
+                done=batch.done[own] | (goes_on & batch.done[other]),
+                obs_next=batch.obs_next[np.where(goes_on, other, own)],
+            )  # fmt: skip
+            every = np.arange(len(own))
+            found[agent] = self.get_algorithm(agent)._preprocess_batch(turns[every], turns, every)
+        return Batch(found)
+
+
+def train(session: Session) -> None:
+    """Train both agents."""
+    games = DummyVectorEnv([lambda: PettingZooEnv(session.env(pad_actions=True))] * BINS)
+    games.seed([session.seed * BINS + k for k in range(BINS)])
+    shown = PettingZooEnv(session.env(pad_actions=True))
+    networks = {agent: ActorCritic("both") for agent in AGENTS}
+    learners = [
+        PPO(
+            policy=DiscreteActorPolicy(actor=Actor(network), action_space=shown.action_space),
+            critic=Critic(network), optim=AdamOptimizerFactory(lr=RATE), gamma=1.0, gae_lambda=0.95,
+            ent_coef=0.005, vf_coef=0.5, max_grad_norm=1.0,
+        )
+        for network in networks.values()
+    ]  # fmt: skip
+    both = Turns(session, algorithms=learners, env=shown)
+    session.watch(*networks.values())
+    buffer = VectorReplayBuffer(BINS * 4096, BINS)
+    collector = Collector(both, games, buffer)
+    collector.reset()
+    while session.go_on():
+        with policy_within_training_step(both.policy):
+            found = collector.collect(n_episode=EPISODES)
+            both.update(buffer, batch_size=MINIBATCH, repeat=EPOCHS)
+        collector.reset_buffer()
+        print(f"{session.placed:,} items, return {found.returns[:, 1].mean():.3f}")
+
+
+if __name__ == "__main__":
+    sys.exit(run("Tianshou", "tianshou", train, description=__doc__))
