@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TRAINERS ?= all
 
-.PHONY: help setup test check bounds play train benchmark clean
+.PHONY: help setup test check bounds trainers play train benchmark clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -29,6 +30,9 @@ bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
 	  tests/test_items.py tests/test_packing.py tests/test_stability_rules.py \
 	  tests/test_stability_properties.py
+
+trainers: $(STAMP)  ## every trainer of examples/ in its own environment, briefly (TRAINERS=ci: four)
+	$(BIN)/nox --tags $(TRAINERS)
 
 play: $(STAMP)  ## one game by a heuristic, shown and drawn
 	$(BIN)/python -m marl_pack.play --policy dblf --seed 0 --picture play.png

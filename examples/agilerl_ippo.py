@@ -1,7 +1,7 @@
 """AgileRL: IPPO for both agents, on the environment's parallel view, turn by turn.
 
 Versions: agilerl 2.58, which needs pettingzoo < 1.27 and so an environment of its own:
-    pip install "agilerl==2.58.*" . && python examples/agilerl_ippo.py --items 100000
+    pip install ".[agilerl]" && python examples/agilerl_ippo.py --items 100000
 
 Traps:
 - AgileRL looks for masks in `info["action_mask"]`, forgets them when it learns (its ratios then

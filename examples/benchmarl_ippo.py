@@ -1,7 +1,7 @@
 """BenchMARL: IPPO for both agents, through a task of our own.
 
 Versions: benchmarl 1.5, which needs an older TorchRL, and so an environment of its own:
-    pip install "benchmarl==1.5.*" . && python examples/benchmarl_ippo.py --items 100000
+    pip install ".[benchmarl]" && python examples/benchmarl_ippo.py --items 100000
 
 Traps:
 - BenchMARL's losses also run over the turns of the *other* agent. :class:`MaskedModel` gives
@@ -12,6 +12,7 @@ Traps:
 
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
 from typing import Any
@@ -129,10 +130,8 @@ def train(session: Session) -> None:
             next(m for m in experiment.group_policies[a].modules() if isinstance(m, ActorCritic))
             for a in AGENTS
         ))  # fmt: skip
-        try:
+        with suppress(Enough):
             experiment.run()
-        except Enough:
-            pass
 
 
 if __name__ == "__main__":

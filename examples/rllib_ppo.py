@@ -1,7 +1,7 @@
 """RLlib, new API stack: PPO with a policy for each agent, on the AEC environment as it is.
 
 Versions: ray 2.60:
-    pip install "ray[rllib]==2.60.*" . && python examples/rllib_ppo.py --items 100000
+    pip install ".[rllib]" && python examples/rllib_ppo.py --items 100000
 
 Traps:
 - Masks are the RLModule's business: :class:`MaskedModule` reads them from the observation. Its

@@ -1,7 +1,7 @@
 """sb3-contrib: MaskablePPO plays both agents' turns with one padded policy.
 
 Versions: sb3-contrib 2.x:
-    pip install . sb3-contrib && python examples/sb3_maskable_ppo.py --items 100000
+    pip install ".[sb3]" && python examples/sb3_maskable_ppo.py --items 100000
 
 Traps:
 - Stable-Baselines3 knows one agent and one action space: ``pad_actions=True`` gives both turns the

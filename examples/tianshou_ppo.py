@@ -1,7 +1,7 @@
 """Tianshou: a PPO for each agent, on the AEC environment with padded spaces.
 
 Versions: tianshou 2.0:
-    pip install "tianshou==2.0.*" . && python examples/tianshou_ppo.py --items 100000
+    pip install ".[tianshou]" && python examples/tianshou_ppo.py --items 100000
 
 Traps:
 - Its PettingZoo wrapper wants one space for all agents: `pad_actions=True`.
@@ -12,6 +12,7 @@ Traps:
 - The collector has to play whole episodes, so that every turn has what followed.
 """
 
+import logging
 import sys
 from typing import Any
 
@@ -92,6 +93,7 @@ class Turns(MultiAgentOnPolicyAlgorithm):
 
 def train(session: Session) -> None:
     """Train both agents."""
+    logging.getLogger("tianshou").setLevel(logging.ERROR)  # it warns of rewards for two agents
     games = DummyVectorEnv([lambda: PettingZooEnv(session.env(pad_actions=True))] * BINS)
     games.seed([session.seed * BINS + k for k in range(BINS)])
     shown = PettingZooEnv(session.env(pad_actions=True))

@@ -1,7 +1,7 @@
 """TorchRL: PPO for both agents, on the AEC environment as it is.
 
 Versions: torchrl 0.14, which needs tensordict < 0.15 and so an environment of its own:
-    pip install torch "torchrl==0.14.*" . && python examples/torchrl_ppo.py --items 100000
+    pip install ".[torchrl]" && python examples/torchrl_ppo.py --items 100000
 
 Traps:
 - Agents are grouped by the part of their name before the underscore: each is its own group here.

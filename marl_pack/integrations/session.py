@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from pettingzoo.utils.wrappers import BaseWrapper
+from scipy import stats
 
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
@@ -86,6 +87,8 @@ class Session:
         self.items, self.seed, self.episodes = chosen.items, chosen.seed, chosen.episodes
         self.bin_size, self.sides = tuple(chosen.bin), tuple(chosen.sides)
         self.json: Path | None = chosen.json
+        if self.episodes < 2:
+            options.error("--episodes: at least 2, for an interval")
         self.end = time.monotonic() + 60 * (chosen.minutes or float("inf"))
         self.start = time.monotonic()
         self.envs: list[Counted] = []
@@ -126,8 +129,11 @@ class Session:
         self.credited[agent] += float(reward)
 
     @torch.no_grad()
-    def play(self) -> float:
-        """Mean utilization over held-out sequences, each agent taking its best action."""
+    def play(self) -> tuple[float, float]:
+        """Mean utilization over held-out sequences, and half its 95 % interval (Student's).
+
+        Each agent takes the action that it finds best.
+        """
         both = self.networks[AGENTS[0]].agent == "both"
         env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
         reached = []
@@ -141,7 +147,9 @@ class Session:
                 planes, mask = (torch.as_tensor(np.asarray(seen[k]))[None]
                                 for k in ("observation", "action_mask"))  # fmt: skip
                 env.step(int(self.networks[agent](planes, mask)[0].argmax()))
-        return float(np.mean(reached))
+        mean = float(np.mean(reached))
+        low, high = stats.ttest_1samp(reached, 0.0).confidence_interval(0.95)
+        return mean, float(high - low) / 2
 
     def account(self, trainer: str, package: str) -> dict[str, Any]:
         """What came of it."""
@@ -166,6 +174,7 @@ class Session:
             "rewards_right": right,
             "rewards": env_rewards,
             "credited": self.credited,
+            "episodes": self.episodes,
             "before": self.utilization_before,
             "after": self.play(),
         }
@@ -196,12 +205,23 @@ def run(
     train(session)
     found = session.account(trainer, package)
     for key, value in found.items():
-        shown = f"{100 * value:.2f} %" if key in ("before", "after") else value
-        print(f"{key}: {shown}")
+        print(f"{key}: {percent(value) if key in ('before', 'after') else value}")
     if session.json is not None:
         write_json(session.json, found)
-    fits = not found["illegal"] and all(
+    if not fits(found):
+        print("DOES NOT FIT", file=sys.stderr)
+        return 1
+    print("fits")
+    return 0
+
+
+def percent(reached: tuple[float, float]) -> str:
+    """A utilization and half its interval, as they are shown."""
+    return f"{100 * reached[0]:.1f} ± {100 * reached[1]:.1f} %"
+
+
+def fits(found: dict[str, Any]) -> bool:
+    """Whether no action was illegal, and both agents learned and were credited right."""
+    return not found["illegal"] and all(
         (*found["updated"].values(), *found["rewards_right"].values())
     )
-    print("fits" if fits else "DOES NOT FIT", file=sys.stderr if not fits else sys.stdout)
-    return 0 if fits else 1

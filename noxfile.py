@@ -1,0 +1,52 @@
+"""Each trainer of ``examples/`` in an environment of its own: ``make trainers``, or ``nox -s sb3``.
+
+Arguments after ``--`` go to the examples: ``nox -s sb3 table -- --minutes 10 --items 1000000``.
+"""
+
+from pathlib import Path
+
+import nox
+
+nox.options.default_venv_backend = "venv"
+nox.options.reuse_existing_virtualenvs = True
+
+EXAMPLES = {
+    "cleanrl": "cleanrl_ppo",
+    "torchrl": "torchrl_ppo",
+    "rllib": "rllib_ppo",
+    "benchmarl": "benchmarl_ippo",
+    "sb3": "sb3_maskable_ppo",
+    "tianshou": "tianshou_ppo",
+    "skrl": "skrl_ippo",
+    "agilerl": "agilerl_ippo",
+}
+IN_CI = ("torchrl", "rllib", "sb3", "tianshou")
+BRIEFLY = ("--items", "2500", "--episodes", "50")
+ACCOUNTS = Path("build/trainers")
+TORCH = next(
+    line for line in Path("constraints.txt").read_text().splitlines() if line.startswith("torch==")
+)
+
+
+def add(trainer: str, example: str) -> None:
+    """A session for one trainer."""
+
+    @nox.session(name=trainer, tags=["all", "ci"] if trainer in IN_CI else ["all"])
+    def train(session: nox.Session) -> None:
+        account = ACCOUNTS / f"{trainer}.json"
+        account.unlink(missing_ok=True)
+        account.parent.mkdir(parents=True, exist_ok=True)
+        extra = "" if trainer == "cleanrl" else f"[{trainer}]"
+        session.install(TORCH, "-e", f".{extra}")
+        arguments = session.posargs or BRIEFLY
+        session.run("python", f"examples/{example}.py", *arguments, "--json", str(account))
+
+
+for trainer, example in EXAMPLES.items():
+    add(trainer, example)
+
+
+@nox.session(venv_backend="none", tags=["all", "ci"])
+def table(session: nox.Session) -> None:
+    """What each trainer did when it was last run."""
+    session.run("python", "-m", "marl_pack.integrations.table", str(ACCOUNTS))
