@@ -89,8 +89,7 @@ class Session:
         self.json: Path | None = chosen.json
         if self.episodes < 2:
             options.error("--episodes: at least 2, for an interval")
-        self.end = time.monotonic() + 60 * (chosen.minutes or float("inf"))
-        self.start = time.monotonic()
+        self.minutes = chosen.minutes or float("inf")
         self.envs: list[Counted] = []
         self.credited = dict.fromkeys(AGENTS, 0.0)
         torch.set_num_threads(1)
@@ -108,7 +107,12 @@ class Session:
 
     def go_on(self) -> bool:
         """Whether there is something left to train on."""
-        return self.placed < self.items and time.monotonic() < self.end
+        return self.placed < self.items and self.taken < self.minutes
+
+    @property
+    def taken(self) -> float:
+        """Minutes since training began."""
+        return (time.monotonic() - self.start) / 60
 
     @property
     def placed(self) -> int:
@@ -116,13 +120,17 @@ class Session:
         return sum(env.items for env in self.envs)
 
     def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
-        """Name the networks that will learn (twice the same, if one plays both turns)."""
+        """Name the networks that will learn (twice the same, if one plays both turns).
+
+        Training begins here: its minutes are counted from now.
+        """
         self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
         self.before = {
             name: [p.detach().clone() for p in network.parameters()]
             for name, network in self.networks.items()
         }
         self.utilization_before = self.play()
+        self.start = time.monotonic()
 
     def credit(self, agent: str, reward: float) -> None:
         """Say what reward the trainer has put down for an agent."""
@@ -153,6 +161,7 @@ class Session:
 
     def account(self, trainer: str, package: str) -> dict[str, Any]:
         """What came of it."""
+        minutes = self.taken
         env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
         updated = {
             a: any(not torch.equal(old, new) for old, new in
@@ -168,7 +177,7 @@ class Session:
             "version": metadata.version(package),
             "bin": self.bin_size,
             "items": self.placed,
-            "minutes": (time.monotonic() - self.start) / 60,
+            "minutes": minutes,
             "illegal": sum(env.illegal for env in self.envs),
             "updated": updated,
             "rewards_right": right,
