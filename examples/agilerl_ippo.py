@@ -27,8 +27,6 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Session, run
 
-TURNS = 2048
-
 
 class Masked(EvolvableModule):
     """An :class:`ActorCritic` as AgileRL wants it."""
@@ -87,8 +85,8 @@ def train(session: Session) -> None:
     }
     both = IPPO(
         spaces.Dict(shown), spaces.Dict({agent: env.action_space(agent) for agent in AGENTS}),
-        agent_ids=AGENTS, batch_size=256, lr=1e-3, learn_step=TURNS, gamma=1.0, gae_lambda=0.95,
-        ent_coef=0.005, max_grad_norm=1.0, update_epochs=4, normalize_images=False,
+        agent_ids=AGENTS, batch_size=256, lr=1e-3, learn_step=session.turns, gamma=1.0,
+        gae_lambda=0.95, ent_coef=0.005, max_grad_norm=1.0, update_epochs=4, normalize_images=False,
         actor_networks=[Actor(agent) for agent in AGENTS],
         critic_networks=[Critic(agent) for agent in AGENTS],
     )  # fmt: skip
@@ -97,7 +95,7 @@ def train(session: Session) -> None:
     done = dict.fromkeys(AGENTS, np.zeros(1))
     while session.go_on():
         turns: list[dict[str, list[Any]]] = [{agent: [] for agent in AGENTS} for _ in range(6)]
-        for _ in range(TURNS):
+        for _ in range(session.turns):
             actions, log_probs, _, values = both.get_action(seen)
             after, rewards, terminated, truncated, _ = env.step(
                 {agent: int(action[0]) for agent, action in actions.items()}

@@ -45,9 +45,8 @@ class Packing(PettingZooClass):
         return True
 
     def max_steps(self, env: Any) -> int:
-        """An episode ends by itself: no more turns than the bin has cells, twice."""
-        width, depth, height = current().bin_size
-        return 2 * width * depth * height
+        """In an evaluation; an episode ends by itself."""
+        return 10**6
 
     def observation_spec(self, env: Any) -> Any:
         """What the model reads: the planes, the mask of actions, and whether the agent acts."""
@@ -112,10 +111,10 @@ def train(session: Session) -> None:
     """Train both agents."""
     settings = ExperimentConfig.get_from_yaml()
     settings.gamma, settings.lr, settings.clip_grad_val = 1.0, 1e-3, 1.0
-    settings.on_policy_collected_frames_per_batch = 2048
+    settings.on_policy_collected_frames_per_batch = session.turns
     settings.on_policy_n_envs_per_worker = 8
     settings.on_policy_n_minibatch_iters = 4
-    settings.on_policy_minibatch_size = 256  # every second turn is the other's
+    settings.on_policy_minibatch_size = min(256, session.turns)  # every second turn is the other's
     settings.evaluation, settings.create_json, settings.loggers = False, False, []
     settings.max_n_frames = 10**9
     algorithm = IppoConfig.get_from_yaml()

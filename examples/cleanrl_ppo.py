@@ -21,7 +21,7 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Counted, Session, run
 
-ITEMS, EPOCHS, MINIBATCH, RATE, CLIP, LAMBDA = 1024, 4, 128, 1e-3, 0.2, 0.95
+EPOCHS, MINIBATCH, RATE, CLIP, LAMBDA = 4, 128, 1e-3, 0.2, 0.95
 
 
 @dataclass
@@ -50,9 +50,9 @@ class Turns:
 
 
 def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) -> dict[str, Turns]:
-    """Play whole episodes until enough items have been placed."""
+    """Play whole episodes until enough turns have been played."""
     turns = {agent: Turns() for agent in AGENTS}
-    target = env.items + ITEMS
+    target = env.items + session.turns // 2
     while env.items < target:
         env.reset()
         for agent in env.agent_iter():

@@ -78,7 +78,7 @@ def train(session: Session) -> None:
             )
         )
         .training(
-            gamma=1.0, lambda_=0.95, lr=1e-3, train_batch_size_per_learner=2048,
+            gamma=1.0, lambda_=0.95, lr=1e-3, train_batch_size_per_learner=session.turns,
             minibatch_size=128, num_epochs=4, entropy_coeff=0.005, use_kl_loss=False,
             vf_clip_param=float("inf"), vf_loss_coeff=0.5, clip_param=0.2, grad_clip=1.0,
         )

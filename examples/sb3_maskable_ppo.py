@@ -103,12 +103,12 @@ def train(session: Session) -> None:
     """Train one policy for both agents."""
     env = Turns(session.env(pad_actions=True), session.seed)
     model = MaskablePPO(
-        Policy, env, learning_rate=1e-3, n_steps=2048, batch_size=128, n_epochs=4, gamma=1.0,
-        gae_lambda=0.95, ent_coef=0.005, max_grad_norm=1.0, seed=session.seed, verbose=1,
-        device="cpu",
+        Policy, env, learning_rate=1e-3, n_steps=session.turns, batch_size=128, n_epochs=4,
+        gamma=1.0, gae_lambda=0.95, ent_coef=0.005, max_grad_norm=1.0, seed=session.seed,
+        verbose=1, device="cpu",
     )  # fmt: skip
     session.watch(model.policy.network, model.policy.network)
-    model.learn(2 * session.items + 2048, callback=Account(session))
+    model.learn(2 * session.items + session.turns, callback=Account(session))
 
 
 if __name__ == "__main__":

@@ -28,8 +28,6 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Session, run
 
-TURNS = 2048
-
 
 class Masked(CategoricalMixin, DeterministicMixin, Model):
     """An :class:`ActorCritic` as skrl wants it: policy and value in one."""
@@ -81,14 +79,14 @@ def train(session: Session) -> None:
     both = Credited(
         possible_agents=AGENTS,
         models={agent: {"policy": model, "value": model} for agent, model in models.items()},
-        memories={agent: RandomMemory(memory_size=TURNS) for agent in AGENTS},
+        memories={agent: RandomMemory(memory_size=session.turns) for agent in AGENTS},
         observation_spaces=env.observation_spaces,
         state_spaces=env.state_spaces,
         action_spaces=env.action_spaces,
         cfg=IPPO_CFG(
-            rollouts=TURNS, learning_epochs=4, mini_batches=16, discount_factor=1.0,
-            gae_lambda=0.95, learning_rate=1e-3, grad_norm_clip=1.0, value_clip=0.0,
-            value_loss_scale=0.5, entropy_loss_scale=0.005,
+            rollouts=session.turns, learning_epochs=4, mini_batches=max(1, session.turns // 128),
+            discount_factor=1.0, gae_lambda=0.95, learning_rate=1e-3, grad_norm_clip=1.0,
+            value_clip=0.0, value_loss_scale=0.5, entropy_loss_scale=0.005,
             experiment={"write_interval": 0, "checkpoint_interval": 0},
             learning_rate_scheduler_kwargs=none, observation_preprocessor_kwargs=none,
             state_preprocessor_kwargs=none, value_preprocessor_kwargs=none,
@@ -98,7 +96,10 @@ def train(session: Session) -> None:
     session.watch(*(models[agent].network for agent in AGENTS))
     # A call of train() is one rollout and one update; it begins with a new episode.
     settings = SequentialTrainerCfg(
-        timesteps=TURNS, headless=True, disable_progressbar=True, close_environment_at_exit=False
+        timesteps=session.turns,
+        headless=True,
+        disable_progressbar=True,
+        close_environment_at_exit=False,
     )
     trainer = SequentialTrainer(env=env, agents=both, cfg=settings)
     while session.go_on():

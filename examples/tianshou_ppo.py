@@ -32,7 +32,7 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Session, run
 
-BINS, EPISODES, EPOCHS, MINIBATCH, RATE = 8, 64, 4, 128, 1e-3
+BINS, EPOCHS, MINIBATCH, RATE = 8, 4, 128, 1e-3
 
 
 def look(network: ActorCritic, seen: Batch) -> tuple[torch.Tensor, torch.Tensor]:
@@ -113,7 +113,7 @@ def train(session: Session) -> None:
     collector.reset()
     while session.go_on():
         with policy_within_training_step(both.policy):
-            found = collector.collect(n_episode=EPISODES)
+            found = collector.collect(n_episode=max(1, session.turns // 32))
             both.update(buffer, batch_size=MINIBATCH, repeat=EPOCHS)
         collector.reset_buffer()
         print(f"{session.placed:,} items, return {found.returns[:, 1].mean():.3f}")

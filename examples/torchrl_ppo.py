@@ -26,7 +26,7 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Session, run
 
-TURNS, EPOCHS, MINIBATCH, RATE = 2048, 4, 128, 1e-3
+EPOCHS, MINIBATCH, RATE = 4, 128, 1e-3
 
 
 class Part(torch.nn.Module):
@@ -75,7 +75,7 @@ def train(session: Session) -> None:
     session.watch(*(networks[agent] for agent in AGENTS))
 
     both = TensorDictSequential(*actors.values())  # the environment plays the acting one's action
-    collector = Collector(env, both, frames_per_batch=TURNS, total_frames=-1)
+    collector = Collector(env, both, frames_per_batch=session.turns, total_frames=-1)
     for data in collector:
         for group, agent in names.items():
             session.credit(agent, data["next", group, "reward"].sum())

@@ -1,6 +1,9 @@
 """What other people's trainers get from us: the network, and the account of what they did."""
 
 import importlib.util
+import json
+import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -10,14 +13,30 @@ import torch
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, run
+from marl_pack.integrations.session import Session, current, run
+from marl_pack.integrations.table import main as show_table
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-SMALL = ["--bin", "5", "5", "5", "--sides", "1", "3", "--items", "40", "--episodes", "2"]
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
+SMALL = [
+    "--bin",
+    "5",
+    "5",
+    "5",
+    "--sides",
+    "1",
+    "3",
+    "--items",
+    "40",
+    "--turns",
+    "80",
+    "--episodes",
+    "9",
+]
 
 
-def example(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+def example(name: str, folder: Path = EXAMPLES) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -63,3 +82,72 @@ def test_a_trainer_that_does_not_fit_is_told(capsys: pytest.CaptureFixture[str])
     assert "illegal: 1" in told.out
     assert "'orientation_0': False" in told.out
     assert "DOES NOT FIT" in told.err
+
+
+def test_rewards_put_down_wrongly_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    def train(session: Session) -> None:
+        assert current() is session
+        example("cleanrl_ppo").train(session)
+        session.credit(AGENTS[0], 0.1)
+
+    assert run("nobody", "marl_pack", train, SMALL) == 1
+    assert "rewards_right: {'orientation_0': False, 'placement_0': True}" in capsys.readouterr().out
+
+
+def test_the_parallel_view_is_counted_as_well() -> None:
+    session = Session([*SMALL, "--seed", "3"])
+    env = session.parallel_env()
+    seen, _ = env.reset(seed=0)
+    rewards = dict.fromkeys(AGENTS, 0.0)
+    while env.agents:
+        seen, got, _, _, _ = env.step({a: int(seen[a]["action_mask"].argmax()) for a in AGENTS})
+        rewards = {a: rewards[a] + got[a] for a in AGENTS}
+    assert session.placed > 1
+    assert session.envs[0].totals == pytest.approx(rewards)
+    assert session.envs[0].illegal == 0
+
+
+def test_accounts_make_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "cleanrl.json"
+    train = example("cleanrl_ppo").train
+    assert run("CleanRL's style", "marl_pack", train, [*SMALL, "--json", str(file)]) == 0
+    monkeypatch.setattr(sys, "argv", ["table", str(tmp_path)])
+    assert show_table() == 0
+    shown = capsys.readouterr().out.splitlines()[-2]
+    account = json.loads(file.read_text())
+    before, after = (f"{100 * account[k][0]:.1f} ± {100 * account[k][1]:.1f} %"
+                     for k in ("before", "after"))  # fmt: skip
+    assert "CleanRL's style" in shown
+    assert "5 × 5 × 5" in shown
+    assert f"  {account['items']}  " in shown
+    assert before in shown
+    assert after in shown
+
+    file.write_text(json.dumps(account | {"illegal": 1}))
+    assert show_table() == 1
+    file.unlink()
+    with pytest.raises(SystemExit):
+        show_table()
+    assert "no account there" in capsys.readouterr().err
+
+
+def test_one_episode_has_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        Session(["--episodes", "1"])
+    assert "at least 2" in capsys.readouterr().err
+
+
+def test_every_example_is_run_and_can_be_installed() -> None:
+    sessions = example("noxfile", ROOT).EXAMPLES
+    assert set(sessions.values()) == {file.stem for file in EXAMPLES.glob("*.py")}
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    for extra, file in sessions.items():
+        head = (EXAMPLES / f"{file}.py").read_text().split('"""')[1]
+        if extra == "cleanrl":  # needs nothing
+            continue
+        assert extra in extras
+        assert f'pip install ".[{extra}]" && python examples/{file}.py' in head

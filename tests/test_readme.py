@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 EXAMPLES = [
     code
-    for name in ("README.md", "docs/physics.md")
+    for name in ("README.md", "docs/physics.md", "docs/environment.md")
     for code in re.findall(r"```python\n(.*?)```", (ROOT / name).read_text("utf-8"), re.DOTALL)
 ]
 
@@ -19,4 +19,4 @@ def test_an_example_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out.strip()
     promised = re.search(r"print\(.*\)  # ([^:\n]*)", code)
     assert printed == promised[1] if promised else printed
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 5

@@ -62,6 +62,7 @@ class Session:
 
     Attributes:
         items: how many items to train on, about.
+        turns: how many turns of both agents to play between two updates, about.
         bin_size: W, D, H in cells.
         seed: of weights and items.
 
@@ -74,6 +75,8 @@ class Session:
         options = argparse.ArgumentParser(description=description)
         add = options.add_argument
         add("--items", type=int, default=100_000, help="to train on (default: 100,000)")
+        add("--turns", type=int, default=2048,
+            help="of both agents between two updates, about (default: 2048)")  # fmt: skip
         add("--minutes", type=float, help="end after so long, whatever is left")
         add("--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
             help="bin size in cells (default: 10 10 10)")  # fmt: skip
@@ -84,7 +87,8 @@ class Session:
         add("--seed", type=int, default=0, help="of weights and items (default: 0)")
         add("--json", type=Path, metavar="FILE", help="write the account there")
         chosen = options.parse_args(arguments)
-        self.items, self.seed, self.episodes = chosen.items, chosen.seed, chosen.episodes
+        self.items, self.turns, self.seed = chosen.items, chosen.turns, chosen.seed
+        self.episodes = chosen.episodes
         self.bin_size, self.sides = tuple(chosen.bin), tuple(chosen.sides)
         self.json: Path | None = chosen.json
         if self.episodes < 2:

@@ -24,9 +24,9 @@ def draw(accounts: Iterable[dict[str, Any]]) -> Table:
     """A row a trainer."""
     table = Table(box=box.SIMPLE)
     table.add_column("trainer", no_wrap=True)
-    for title in ("version", "bin", "items", "minutes", "illegal actions", "both agents updated",
-                  "rewards right", "utilization before", "after"):  # fmt: skip
-        table.add_column(title, justify="right")
+    for title in ("version", "bin", "items", "minutes", "illegal\nactions", "both agents\nupdated",
+                  "rewards\nright", "utilization\nbefore", "utilization\nafter"):  # fmt: skip
+        table.add_column(title, justify="right", no_wrap=True)
     for found in accounts:
         table.add_row(
             found["trainer"],
@@ -51,7 +51,7 @@ def main() -> int:
     if not files:
         parser.error("no account there; examples write one with --json FILE")
     accounts = [json.loads(file.read_text()) for file in files]
-    Console(width=None if sys.stdout.isatty() else 120).print(draw(accounts))
+    Console(width=None if sys.stdout.isatty() else 140).print(draw(accounts))
     return 0 if all(map(fits, accounts)) else 1
 
 
