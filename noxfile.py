@@ -23,9 +23,8 @@ EXAMPLES = {
 IN_CI = ("torchrl", "rllib", "sb3", "tianshou")
 BRIEFLY = ("--items", "2500", "--episodes", "50")
 ACCOUNTS = Path("build/trainers")
-TORCH = next(
-    line for line in Path("constraints.txt").read_text().splitlines() if line.startswith("torch==")
-)
+CONSTRAINTS = Path(__file__).with_name("constraints.txt")
+TORCH = next(line for line in CONSTRAINTS.read_text().splitlines() if line.startswith("torch=="))
 
 
 def add(trainer: str, example: str) -> None:

@@ -5,8 +5,8 @@ Versions: agilerl 2.58, which needs pettingzoo < 1.27 and so an environment of i
 
 Traps:
 - AgileRL looks for masks in `info["action_mask"]`, forgets them when it learns (its ratios then
-  compare masked with unmasked probabilities), and its vectorized environments show the mask from
-  before an automatic reset. So the mask travels in the observation here, under another name (it
+  compare masked with unmasked probabilities), and its `PzDummyVecEnv` shows the mask from before an
+  automatic reset. So the mask travels in the observation here, under another name (it
   refuses `action_mask` there), and the networks of :class:`Masked` apply it, when learning too.
 - Its training loop clears `done` before it is stored when all agents end at once, so advantages
   would run on into the next episode: the loop here is our own.
@@ -86,7 +86,8 @@ def train(session: Session) -> None:
     both = IPPO(
         spaces.Dict(shown), spaces.Dict({agent: env.action_space(agent) for agent in AGENTS}),
         agent_ids=AGENTS, batch_size=256, lr=1e-3, learn_step=session.turns, gamma=1.0,
-        gae_lambda=0.95, ent_coef=0.005, max_grad_norm=1.0, update_epochs=4, normalize_images=False,
+        gae_lambda=0.975, ent_coef=0.005, max_grad_norm=1.0, update_epochs=4,
+        normalize_images=False,
         actor_networks=[Actor(agent) for agent in AGENTS],
         critic_networks=[Critic(agent) for agent in AGENTS],
     )  # fmt: skip
@@ -101,12 +102,13 @@ def train(session: Session) -> None:
                 {agent: int(action[0]) for agent, action in actions.items()}
             )
             for agent in AGENTS:
-                session.credit(agent, rewards[agent])
                 step = (seen, actions, log_probs, None, done, values)
                 for kept, now in zip(turns, step, strict=True):
                     kept[agent].append(np.array([rewards[agent]]) if now is None else now[agent])
             done = {a: np.array([float(terminated[a] or truncated[a])]) for a in AGENTS}
             seen = renamed(after if env.agents else env.reset()[0])
+        for agent in AGENTS:
+            session.credit(agent, np.sum(turns[3][agent]))
         both.learn((*turns, seen, done))
         print(f"{session.placed:,} items, reward an item {2 * np.mean(turns[3][AGENTS[1]]):.4f}")
 

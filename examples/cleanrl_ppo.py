@@ -62,13 +62,14 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
                 own.rewards[-1] = reward
                 own.ends[-1] = terminated or truncated
                 session.credit(agent, reward)
+            planes, mask = (torch.from_numpy(seen[k]) for k in ("observation", "action_mask"))
+            with torch.no_grad():
+                logits, value = networks[agent](planes[None], mask[None])
+            if truncated and own.actions:  # cut off, not at an end: more would have come
+                own.rewards[-1] += float(value)
             if terminated or truncated:
                 env.step(None)
                 continue
-            planes = torch.from_numpy(seen["observation"])
-            mask = torch.from_numpy(seen["action_mask"])
-            with torch.no_grad():
-                logits, value = networks[agent](planes[None], mask[None])
             choice = Categorical(logits=logits)
             action = choice.sample()
             own.planes.append(planes)

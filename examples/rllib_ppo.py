@@ -8,7 +8,8 @@ Traps:
   `ValueFunctionAPI` is what the connectors ask for values with.
 - Ray makes the environments from a pickled function, so what it closes over is a copy. Here all
   runs in one process (`num_env_runners=0`) and the function looks the session up.
-- The default `vf_clip_param` of 10 and the KL penalty are off: returns are below 1.
+- A seed in `.debugging(seed=…)` would be given to *every* reset (with complete episodes), so that
+  all episodes have the same items: seed the environment once, when it is made.
 - Use `batch_mode="complete_episodes"`: a cut between the two agents' turns leaves one of them
   without its reward.
 """
@@ -50,6 +51,13 @@ class MaskedModule(TorchRLModule, ValueFunctionAPI):
         return self._look(batch)[1]
 
 
+def make_env(_: Any) -> PettingZooEnv:
+    """The environment, with its stream begun: whatever resets follow go on in it."""
+    env = current().env()
+    env.reset(seed=current().seed)
+    return PettingZooEnv(env)
+
+
 def credit(*, samples: list[Any], **_: Any) -> None:
     """Tell the session what RLlib has put down for the agents."""
     for episode in samples:
@@ -59,7 +67,7 @@ def credit(*, samples: list[Any], **_: Any) -> None:
 
 def train(session: Session) -> None:
     """Train both agents."""
-    register_env("packing", lambda _: PettingZooEnv(current().env()))
+    register_env("packing", make_env)
     config = (
         PPOConfig()
         .environment("packing")
@@ -83,7 +91,7 @@ def train(session: Session) -> None:
             vf_clip_param=float("inf"), vf_loss_coeff=0.5, clip_param=0.2, grad_clip=1.0,
         )
         .callbacks(on_sample_end=credit)
-        .debugging(seed=session.seed, log_level="ERROR")
+        .debugging(log_level="ERROR")
     )  # fmt: skip
     algorithm = config.build_algo()
     session.watch(*(algorithm.get_module(agent).network for agent in AGENTS))

@@ -1,6 +1,6 @@
 """sb3-contrib: MaskablePPO plays both agents' turns with one padded policy.
 
-Versions: sb3-contrib 2.x:
+Versions: sb3-contrib 2.9:
     pip install ".[sb3]" && python examples/sb3_maskable_ppo.py --items 100000
 
 Traps:
@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
-from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
 from marl_pack.env_aec import AGENTS
@@ -86,29 +85,19 @@ class Policy(MaskableMultiInputActorCriticPolicy):
         return self._look(obs)[1]
 
 
-class Account(BaseCallback):
-    """Ends in time, and tells the session what was put down for the agents."""
-
-    def __init__(self, session: Session) -> None:
-        super().__init__()
-        self.session = session
-
-    def _on_step(self) -> bool:
-        for agent in AGENTS:
-            self.session.credit(agent, self.locals["rewards"][0])
-        return self.session.go_on()
-
-
 def train(session: Session) -> None:
     """Train one policy for both agents."""
     env = Turns(session.env(pad_actions=True), session.seed)
     model = MaskablePPO(
         Policy, env, learning_rate=1e-3, n_steps=session.turns, batch_size=128, n_epochs=4,
-        gamma=1.0, gae_lambda=0.95, ent_coef=0.005, max_grad_norm=1.0, seed=session.seed,
+        gamma=1.0, gae_lambda=0.975, ent_coef=0.005, max_grad_norm=1.0, seed=session.seed,
         verbose=1, device="cpu",
     )  # fmt: skip
     session.watch(model.policy.network, model.policy.network)
-    model.learn(2 * session.items + session.turns, callback=Account(session))
+    while session.go_on():  # a call is one rollout and one update
+        model.learn(session.turns, reset_num_timesteps=False)
+        for agent in AGENTS:
+            session.credit(agent, model.rollout_buffer.rewards.sum())
 
 
 if __name__ == "__main__":

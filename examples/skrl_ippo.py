@@ -64,6 +64,7 @@ class Credited(IPPO):
 
 def train(session: Session) -> None:
     """Train both agents."""
+    config.torch.device = "cpu"
     config.torch.key = session.seed  # of the items: the wrapper's first reset takes it
     env = wrap_env(session.parallel_env(), wrapper="pettingzoo")
     spaces = {
@@ -85,8 +86,9 @@ def train(session: Session) -> None:
         action_spaces=env.action_spaces,
         cfg=IPPO_CFG(
             rollouts=session.turns, learning_epochs=4, mini_batches=max(1, session.turns // 128),
-            discount_factor=1.0, gae_lambda=0.95, learning_rate=1e-3, grad_norm_clip=1.0,
+            discount_factor=1.0, gae_lambda=0.975, learning_rate=1e-3, grad_norm_clip=1.0,
             value_clip=0.0, value_loss_scale=0.5, entropy_loss_scale=0.005,
+            time_limit_bootstrap=True,
             experiment={"write_interval": 0, "checkpoint_interval": 0},
             learning_rate_scheduler_kwargs=none, observation_preprocessor_kwargs=none,
             state_preprocessor_kwargs=none, value_preprocessor_kwargs=none,

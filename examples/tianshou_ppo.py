@@ -9,7 +9,8 @@ Traps:
   placement, which both agents get, would go to the placement agent alone, the orientation agent
   would see nothing but zeros and no end of an episode, and both would be valued by what the *other*
   one sees next. :class:`Turns` gives each agent its own turns in a row instead.
-- The collector has to play whole episodes, so that every turn has what followed.
+- The collector has to play whole episodes, so that every turn has what followed, and the buffer to
+  hold them all: what no longer fits would be overwritten from the front.
 """
 
 import logging
@@ -108,12 +109,15 @@ def train(session: Session) -> None:
     ]  # fmt: skip
     both = Turns(session, algorithms=learners, env=shown)
     session.watch(*networks.values())
-    buffer = VectorReplayBuffer(BINS * 4096, BINS)
+    width, depth, height = session.bin_size
+    most = 2 * width * depth * height // min(session.sides) ** 3  # turns of an episode
+    buffer = VectorReplayBuffer(BINS * (session.turns + most), BINS)
     collector = Collector(both, games, buffer)
     collector.reset()
     while session.go_on():
         with policy_within_training_step(both.policy):
-            found = collector.collect(n_episode=max(1, session.turns // 32))
+            while len(buffer) < session.turns:
+                found = collector.collect(n_episode=BINS)  # one episode a bin
             both.update(buffer, batch_size=MINIBATCH, repeat=EPOCHS)
         collector.reset_buffer()
         print(f"{session.placed:,} items, return {found.returns[:, 1].mean():.3f}")

@@ -4,10 +4,10 @@ Versions: torchrl 0.14, which needs tensordict < 0.15 and so an environment of i
     pip install ".[torchrl]" && python examples/torchrl_ppo.py --items 100000
 
 Traps:
-- Agents are grouped by the part of their name before the underscore: each is its own group here.
-- Every agent has an entry at every turn; ``(group, "mask")`` says who acted. GAE has to run over
-  all turns, then only the acting ones may go into the loss.
-- The agent that does not act has a mask of all ones, and an action that is ignored.
+- In the other's turn TorchRL's mask is full. :class:`Part` takes it as empty, so that logits are
+  constant and no gradient reaches the policy from that turn; the critic learns its value.
+- GAE runs over all turns, so the critic has to be trained on all of them too.
+- `PettingZooWrapper(use_mask=True)` makes each agent of an AEC environment a group of its own.
 """
 
 import sys
@@ -15,6 +15,7 @@ import sys
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.collectors import Collector
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
@@ -26,7 +27,7 @@ from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.session import Session, run
 
-EPOCHS, MINIBATCH, RATE = 4, 128, 1e-3
+EPOCHS, MINIBATCH, RATE = 4, 256, 1e-3  # in every second turn an agent acts
 
 
 class Part(torch.nn.Module):
@@ -36,66 +37,64 @@ class Part(torch.nn.Module):
         super().__init__()
         self.network, self.part = network, part
 
-    def forward(self, planes: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    def forward(self, planes: Tensor, mask: Tensor, acts: Tensor) -> Tensor:
         """Logits, or values."""
-        lead = planes.shape[:-3]
-        out = self.network(planes.reshape(-1, *planes.shape[-3:]), mask.reshape(-1, mask.shape[-1]))
+        lead, legal = planes.shape[:-3], mask & acts[..., None]
+        out = self.network(
+            planes.reshape(-1, *planes.shape[-3:]), legal.reshape(-1, mask.shape[-1])
+        )
         return out[self.part].reshape(*lead, -1)
 
 
 def train(session: Session) -> None:
     """Train both agents."""
     env = PettingZooWrapper(session.env(), use_mask=True, seed=session.seed)
-    names = {group: members[0] for group, members in env.group_map.items()}
     networks, actors, losses, advantages, optimizers = {}, {}, {}, {}, {}
-    for group, agent in names.items():
+    for agent in AGENTS:
         networks[agent] = ActorCritic(agent.partition("_")[0])
-        seen = [(group, "observation", "observation"), (group, "action_mask")]
-        actors[group] = ProbabilisticActor(
-            TensorDictModule(Part(networks[agent], 0), seen, [(group, "logits")]),
-            in_keys={"logits": (group, "logits")}, out_keys=[(group, "action")],
+        seen = [(agent, "observation", "observation"), (agent, "action_mask"), (agent, "mask")]
+        actors[agent] = ProbabilisticActor(
+            TensorDictModule(Part(networks[agent], 0), seen, [(agent, "logits")]),
+            in_keys={"logits": (agent, "logits")}, out_keys=[(agent, "action")],
             distribution_class=Categorical, return_log_prob=True,
-            log_prob_key=(group, "log_prob"),
+            log_prob_key=(agent, "log_prob"),
         )  # fmt: skip
         critic = TensorDictModule(
-            Part(ActorCritic(agent.partition("_")[0]), 1), seen, [(group, "value")]
+            Part(ActorCritic(agent.partition("_")[0]), 1), seen, [(agent, "value")]
         )
-        keys = {key: (group, key) for key in
+        keys = {key: (agent, key) for key in
                 ("value", "advantage", "value_target", "reward", "done", "terminated")}  # fmt: skip
-        advantages[group] = GAE(gamma=1.0, lmbda=0.95, value_network=critic, average_gae=False)
-        advantages[group].set_keys(**keys)
-        losses[group] = ClipPPOLoss(
-            actors[group], critic, clip_epsilon=0.2, entropy_coeff=0.005, critic_coeff=0.5,
+        advantages[agent] = GAE(gamma=1.0, lmbda=0.975, value_network=critic, average_gae=False)
+        advantages[agent].set_keys(**keys)
+        losses[agent] = ClipPPOLoss(
+            actors[agent], critic, clip_epsilon=0.2, entropy_coeff=0.005, critic_coeff=0.5,
             normalize_advantage=True,
         )  # fmt: skip
-        losses[group].set_keys(
-            **keys, action=(group, "action"), sample_log_prob=(group, "log_prob")
+        losses[agent].set_keys(
+            **keys, action=(agent, "action"), sample_log_prob=(agent, "log_prob")
         )
-        optimizers[group] = torch.optim.Adam(losses[group].parameters(), RATE)
+        optimizers[agent] = torch.optim.Adam(losses[agent].parameters(), RATE)
     session.watch(*(networks[agent] for agent in AGENTS))
 
     both = TensorDictSequential(*actors.values())  # the environment plays the acting one's action
     collector = Collector(env, both, frames_per_batch=session.turns, total_frames=-1)
     for data in collector:
-        for group, agent in names.items():
-            session.credit(agent, data["next", group, "reward"].sum())
-            learn(data, group, advantages[group], losses[group], optimizers[group])
+        for agent in AGENTS:
+            session.credit(agent, data["next", agent, "reward"].sum())
+            learn(data, advantages[agent], losses[agent], optimizers[agent])
         reached = data["next", AGENTS[1], "info", "utilization"][data["next", "done"].flatten()]
         print(f"{session.placed:,} items, utilization {reached.mean():.3f}")
         if not session.go_on():
             break
 
 
-def learn(
-    data: TensorDict, group: str, advantage: GAE, loss: ClipPPOLoss, optimizer: torch.optim.Adam
-) -> None:
-    """PPO's epochs on the turns in which the agent acted."""
+def learn(data: TensorDict, advantage: GAE, loss: ClipPPOLoss, optimizer: torch.optim.Adam) -> None:
+    """PPO's epochs of one agent."""
     with torch.no_grad():
         data = advantage(data)
-    own = data[data[group, "mask"].flatten()]
     for _ in range(EPOCHS):
-        for part in torch.randperm(len(own)).split(MINIBATCH):
-            terms = loss(own[part])
+        for part in torch.randperm(len(data)).split(MINIBATCH):
+            terms = loss(data[part])
             total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
             optimizer.zero_grad()
             total.backward()

@@ -149,6 +149,16 @@ def falls(
     }
 
 
+def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
+    """The 95 % interval of the mean (Student's); None for a single value."""
+    if len(values) < 2:
+        return None
+    if np.ptp(values) == 0:  # Student's would be NaN
+        return float(values[0]), float(values[0])
+    bounds = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    return float(bounds.low), float(bounds.high)
+
+
 def mean_utilization(played: Episodes) -> dict[str, Any]:
     """Mean utilization with its 95 % interval (Student's, over episodes), and items packed.
 
@@ -156,18 +166,13 @@ def mean_utilization(played: Episodes) -> dict[str, Any]:
     volume. A single episode has no interval and no std (None).
     """
     u = played.utilization
-    low = high = std = None
-    if len(u) > 1 and np.ptp(u) == 0:
-        low, high, std = float(u[0]), float(u[0]), 0.0
-    elif len(u) > 1:
-        bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
-        low, high, std = float(bounds.low), float(bounds.high), float(u.std(ddof=1))
+    low, high = interval(u) or (None, None)
     return {
         "episodes": len(u),
         "utilization": float(u.mean()),
         "low": low,
         "high": high,
-        "std": std,
+        "std": float(u.std(ddof=1)) if len(u) > 1 else None,
         "packed": float(played.packed.mean()),
     }
 

@@ -13,8 +13,8 @@ FLOORS = (
     ("bins", "files", "item_files", "items", "render", "sapien_check"),
     ("stability",),
     ("packing",),
-    ("env_aec", "vec_env", "agents", "integrations"),
-    ("config", "evaluate", "export", "play", "train"),
+    ("env_aec", "vec_env", "agents"),
+    ("config", "evaluate", "export", "integrations", "play", "train"),
 )
 
 

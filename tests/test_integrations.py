@@ -6,9 +6,11 @@ import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
+from pettingzoo.utils.wrappers import BaseWrapper
 
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
@@ -92,6 +94,40 @@ def test_rewards_put_down_wrongly_are_told(capsys: pytest.CaptureFixture[str]) -
 
     assert run("nobody", "marl_pack", train, SMALL) == 1
     assert "rewards_right: {'orientation_0': False, 'placement_0': True}" in capsys.readouterr().out
+
+
+def test_items_that_repeat_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    def train(session: Session) -> None:
+        made = session.env
+        session.env = lambda **options: Seeded(made(**options))  # type: ignore[method-assign]  # on purpose
+        example("cleanrl_ppo").train(session)
+
+    class Seeded(BaseWrapper):
+        def reset(self, seed: int | None = None, options: object = None) -> None:
+            self.env.reset(seed=7)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.env, name)
+
+    assert run("nobody", "marl_pack", train, SMALL) == 1
+    assert "repeats: 0" not in capsys.readouterr().out
+
+
+def test_an_agent_whose_critic_alone_learns_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    def train(session: Session) -> None:
+        cleanrl = example("cleanrl_ppo")
+        learn = cleanrl.learn
+
+        def only_values(turns: Any, network: ActorCritic, optimizer: Any) -> None:
+            head = network.turns.weight
+            head.requires_grad_(network.agent != "orientation")
+            learn(turns, network, optimizer)
+
+        cleanrl.learn = only_values
+        cleanrl.train(session)
+
+    assert run("nobody", "marl_pack", train, SMALL) == 1
+    assert "updated: {'orientation_0': False, 'placement_0': True}" in capsys.readouterr().out
 
 
 def test_the_parallel_view_is_counted_as_well() -> None:

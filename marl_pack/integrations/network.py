@@ -39,6 +39,11 @@ class ActorCritic(nn.Module):
             nn.Linear(2 * channels, 64), nn.ReLU(), nn.Linear(64, 1)
         )  # fmt: skip
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return self.cells.weight.device
+
     def forward(self, planes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Masked logits [B, n] and values [B].
 

@@ -1,8 +1,9 @@
 """An example's command line, and the account of what its trainer did with the environment.
 
-A trainer fits if it plays no illegal action, changes the weights of both agents, and credits both
-with the environment's rewards. :class:`Session` sees to all three from outside: it wraps the
-environment, keeps the weights from before, and plays held-out sequences before and after.
+A trainer fits if it plays no illegal action, goes on to new items, changes what both agents choose
+by, and credits both with the environment's rewards (in sum). :class:`Session` sees to that from
+outside: it wraps the environment, keeps weights from before, and plays held-out sequences before
+and after.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from typing import Any
 import numpy as np
 import torch
 from pettingzoo.utils.wrappers import BaseWrapper
-from scipy import stats
 
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
+from marl_pack.evaluate import interval
 from marl_pack.files import write_json
 from marl_pack.integrations.network import ActorCritic
 
@@ -35,13 +36,19 @@ class Counted(BaseWrapper):
     Attributes:
         items: items placed.
         illegal: actions played against the mask.
+        seeded: resets with a seed, each of which begins the stream of items anew.
         totals: agent -> sum of its rewards.
     """
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
-        self.items, self.illegal = 0, 0
+        self.items, self.illegal, self.seeded = 0, 0, 0
         self.totals = dict.fromkeys(AGENTS, 0.0)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begin an episode."""
+        self.seeded += seed is not None
+        super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> None:
         """Play the action."""
@@ -98,6 +105,7 @@ class Session:
         self.credited = dict.fromkeys(AGENTS, 0.0)
         torch.set_num_threads(1)
         torch.manual_seed(chosen.seed)
+        np.random.seed(chosen.seed)  # noqa: NPY002  # some trainers draw from there
 
     def env(self, **options: Any) -> Counted:
         """A new AEC environment (:func:`marl_pack.env_aec.env`), counted."""
@@ -129,12 +137,17 @@ class Session:
         Training begins here: its minutes are counted from now.
         """
         self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
-        self.before = {
-            name: [p.detach().clone() for p in network.parameters()]
-            for name, network in self.networks.items()
-        }
+        self.before = {name: self._head(name) for name in AGENTS}
         self.utilization_before = self.play()
+        for env in self.envs:
+            env.seeded = 0
         self.start = time.monotonic()
+
+    def _head(self, agent: str) -> torch.Tensor:
+        """The weights that only the agent's own choices move, not the critic."""
+        network = self.networks[agent]
+        head = network.turns if agent == AGENTS[0] else network.cells
+        return head.weight.detach().cpu().clone()
 
     def credit(self, agent: str, reward: float) -> None:
         """Say what reward the trainer has put down for an agent."""
@@ -156,22 +169,18 @@ class Session:
                 if terminated or truncated:
                     reached.append(info["utilization"])
                     break
-                planes, mask = (torch.as_tensor(np.asarray(seen[k]))[None]
+                network = self.networks[agent]
+                planes, mask = (torch.as_tensor(seen[k], device=network.device)[None]
                                 for k in ("observation", "action_mask"))  # fmt: skip
-                env.step(int(self.networks[agent](planes, mask)[0].argmax()))
-        mean = float(np.mean(reached))
-        low, high = stats.ttest_1samp(reached, 0.0).confidence_interval(0.95)
-        return mean, float(high - low) / 2
+                env.step(int(network(planes, mask)[0].argmax()))
+        low, high = interval(np.array(reached)) or (np.nan, np.nan)  # there are two or more
+        return float(np.mean(reached)), (high - low) / 2
 
     def account(self, trainer: str, package: str) -> dict[str, Any]:
         """What came of it."""
         minutes = self.taken
         env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
-        updated = {
-            a: any(not torch.equal(old, new) for old, new in
-                   zip(self.before[a], self.networks[a].parameters(), strict=True))
-            for a in AGENTS
-        }  # fmt: skip
+        updated = {a: not torch.equal(self.before[a], self._head(a)) for a in AGENTS}
         right = {
             a: abs(env_rewards[a] - self.credited[a]) <= 1e-4 * max(1.0, abs(env_rewards[a]))
             for a in AGENTS
@@ -183,6 +192,7 @@ class Session:
             "items": self.placed,
             "minutes": minutes,
             "illegal": sum(env.illegal for env in self.envs),
+            "repeats": sum(max(0, env.seeded - 1) for env in self.envs),
             "updated": updated,
             "rewards_right": right,
             "rewards": env_rewards,
@@ -211,7 +221,7 @@ def run(
     """Run an example and print its account.
 
     Returns:
-        The exit status: 0 if no action was illegal, both agents learned and were credited right.
+        The exit status: 0 if it :func:`fits`.
     """
     session = Session(arguments, description)
     _running.append(session)
@@ -234,7 +244,11 @@ def percent(reached: tuple[float, float]) -> str:
 
 
 def fits(found: dict[str, Any]) -> bool:
-    """Whether no action was illegal, and both agents learned and were credited right."""
-    return not found["illegal"] and all(
-        (*found["updated"].values(), *found["rewards_right"].values())
+    """Whether items came, ever new ones, no action was illegal, both agents learned and got all."""
+    return bool(
+        found["items"]
+        and not found["illegal"]
+        and not found["repeats"]
+        and all(found["updated"].values())
+        and all(found["rewards_right"].values())
     )

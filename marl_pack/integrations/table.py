@@ -24,8 +24,10 @@ def draw(accounts: Iterable[dict[str, Any]]) -> Table:
     """A row a trainer."""
     table = Table(box=box.SIMPLE)
     table.add_column("trainer", no_wrap=True)
-    for title in ("version", "bin", "items", "minutes", "illegal\nactions", "both agents\nupdated",
-                  "rewards\nright", "utilization\nbefore", "utilization\nafter"):  # fmt: skip
+    for title in (
+        "version", "bin", "items", "minutes", "illegal\nactions", "items\nrepeat",
+        "both agents\nupdated", "rewards\nright", "utilization\nbefore", "utilization\nafter",
+    ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
     for found in accounts:
         table.add_row(
@@ -35,6 +37,7 @@ def draw(accounts: Iterable[dict[str, Any]]) -> Table:
             f"{found['items']:,}",
             f"{found['minutes']:.1f}",
             f"{found['illegal']:,}",
+            "YES" if found["repeats"] else "no",
             "yes" if all(found["updated"].values()) else "NO",
             "yes" if all(found["rewards_right"].values()) else "NO",
             percent(found["before"]),
