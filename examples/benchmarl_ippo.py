@@ -1,7 +1,8 @@
 """BenchMARL: IPPO for both agents, through a task of our own.
 
 Versions: benchmarl 1.5, which needs an older TorchRL, and so an environment of its own:
-    pip install ".[benchmarl]" && python examples/benchmarl_ippo.py --items 100000
+    pip install ".[benchmarl]" && python examples/benchmarl_ippo.py --items 1000000 --minutes 10
+    Ten minutes on a busy core: 29,696 items, utilization 58.9 → 71.6 %
 
 Traps:
 - BenchMARL's losses also run over the turns of the *other* agent. :class:`MaskedModel` gives

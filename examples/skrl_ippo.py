@@ -1,7 +1,8 @@
 """skrl: IPPO for both agents, on the environment's parallel view, turn by turn.
 
 Versions: skrl 2.1:
-    pip install ".[skrl]" && python examples/skrl_ippo.py --items 100000
+    pip install ".[skrl]" && python examples/skrl_ippo.py --items 1000000 --minutes 10
+    Ten minutes on a busy core: 34,816 items, utilization 52.3 → 69.6 %
 
 Traps:
 - skrl takes PettingZoo's parallel API alone. `env_aec.parallel_env()` is turn-based, so its masks
