@@ -3,6 +3,7 @@
 Arguments after ``--`` go to the examples: ``nox -s sb3 table -- --minutes 10 --items 1000000``.
 """
 
+import sys
 from pathlib import Path
 
 import nox
@@ -48,4 +49,6 @@ for trainer, example in EXAMPLES.items():
 @nox.session(venv_backend="none", tags=["all", "ci"])
 def table(session: nox.Session) -> None:
     """What each trainer did when it was last run."""
-    session.run("python", "-m", "marl_pack.integrations.table", str(ACCOUNTS))
+    session.run(  # with nox's own Python: marl_pack is beside it
+        sys.executable, "-m", "marl_pack.integrations.table", str(ACCOUNTS), external=True
+    )
