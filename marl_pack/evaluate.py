@@ -29,7 +29,7 @@ from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_polic
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
 from marl_pack.files import check_writable, write_atomically, write_json
-from marl_pack.items import DEFAULT_SIDES, GENERATED, choose_stream
+from marl_pack.items import DEFAULT_SIDES, GENERATED, Size, choose_stream, make_stream
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
 from marl_pack.sapien_check.packings import Bodies
@@ -282,6 +282,9 @@ def parser() -> argparse.ArgumentParser:
     add("--placement", metavar="NAME",
         help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a run's "
              "folder or a checkpoint")  # fmt: skip
+    add("--plan", metavar="rollouts=K,top=M",
+        help="learned agents try their M best pairs in K imagined futures before each placement; "
+             "depth=D ends each future after D items by the critic's word")  # fmt: skip
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
         help="bin size in cells; a file brings its own")  # fmt: skip
@@ -351,6 +354,33 @@ def choose_policies(
     return policies, learned
 
 
+def with_plans(
+    policies: dict[str, Policy], arguments: argparse.Namespace, size: Size
+) -> dict[str, Policy]:
+    """The learned policies, planning as ``--plan`` says; heuristics stay as they are.
+
+    Raises:
+        ValueError: if the plan cannot be read, or there is no checkpoint to plan with.
+    """
+    from marl_pack.agents import checkpoint
+    from marl_pack.agents.planning import Plan, make_planner
+
+    plan = Plan.parse(arguments.plan)
+    if all(name in POLICIES for name in policies) or arguments.orientation is not None:
+        raise ValueError("--plan goes with --policy and a run's folder or checkpoint")
+    futures = make_stream("rs", size, tuple(arguments.sides)).to(arguments.device)
+    planned: dict[str, Policy] = {}
+    for name, policy in policies.items():
+        if name in POLICIES:
+            planned[name] = policy
+        else:
+            found = checkpoint.read(name, arguments.device)
+            planned[f"{name}, {plan}"] = make_planner(
+                found, plan, futures, arguments.device, arguments.seed
+            )
+    return planned
+
+
 def choose_game(arguments: argparse.Namespace, learned: dict[str, Any]) -> None:
     """Fill the options on the game that were not given.
 
@@ -394,6 +424,8 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     stream, size = choose_stream(
         arguments.items, tuple(arguments.bin) if arguments.bin else None, tuple(arguments.sides)
     )
+    if arguments.plan is not None:
+        policies = with_plans(policies, arguments, size)
     episodes = arguments.episodes
     if episodes is None:
         episodes = stream.episodes or EPISODES

@@ -72,6 +72,8 @@ def example(agent: str, planes: Sequence[str], batch: int, size: tuple[int, int,
         seen["rest"] = draw(height, *shape)
     if "waste" in planes:
         seen["waste"] = draw(20, *shape)
+    if "solid" in planes:
+        seen["solid"] = torch.ones(batch, width, depth, dtype=torch.bool)
     return seen
 
 
@@ -80,8 +82,8 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 
     Inputs are the groups of the agent's ``observe``, whole numbers as int64: ``heightmap``
     [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and ``cells`` bool,
-    ``rest``, ``waste`` [B, A, W, D] where its network has these planes. Outputs are ``action``
-    int64 [B] and ``probabilities`` float32 [B, K].
+    ``rest``, ``waste`` [B, A, W, D], ``solid`` bool [B, W, D] where its network has these planes.
+    Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
 
     Returns:
         The names of the inputs.
@@ -101,6 +103,7 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
     }
     for plane in ("cells", "rest", "waste"):
         shapes[plane] = {0: batch, 2: width, 3: depth}
+    shapes["solid"] = shapes["heightmap"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(

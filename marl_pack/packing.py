@@ -9,6 +9,7 @@ has no legal cell in any orientation, or when its stream has no more items.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -242,6 +243,36 @@ class Packing:
         if self.auto_reset:
             self._begin(done.nonzero().squeeze(1))
         return Outcome(reward, done, filled, placed, self.volume)
+
+    def branch(
+        self,
+        which: Tensor,
+        stream: Stream | None = None,
+        seed: int = 0,
+        episodes: Tensor | None = None,
+    ) -> Packing:
+        """A game of its own that begins with copies of some of these bins, as they are now.
+
+        Its bins are not begun anew when they end.
+
+        Args:
+            which: int64 [K], bins to copy; one may come several times.
+            stream: what comes after the visible items; as here, unless given.
+            seed, episodes: int64 [K], the episodes of ``stream`` that come.
+        """
+        game = copy.copy(self)
+        game.n, game.auto_reset = len(which), False
+        game._index = torch.arange(len(which), device=self.device)
+        game.bins, game.bin_height = self.bins[which], self.bin_height[which]
+        for name in ("items", "weights", "mask", "orientation_mask", "alive", "lost", "t"):
+            setattr(game, name, getattr(self, name)[which])
+        if stream is None:
+            game.episode, game.stream_state = self.episode[which], self.stream_state[which]
+        else:
+            assert episodes is not None
+            game.stream, game.seed, game.episode = stream, seed, episodes
+            game.stream_state = stream.start(seed, episodes)
+        return game
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that the rest of the game depends on, to be kept and loaded again."""

@@ -43,7 +43,19 @@ def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
     assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
     game = Packing(2, (6, 6, 6), sides=(2, 4))
     seen = orientation.observe(game, PLANES)
-    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 3 * 6, 6, 6)
+    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 3 * 6 + 1, 6, 6)
+
+
+def test_solid_are_the_columns_without_a_gap() -> None:
+    # A box of 2 x 2 x 2, then a plank across it and beyond.
+    game = Packing(1, (4, 2, 8), [[2, 2, 2], [3, 2, 1], [1, 1, 1]])
+    game.place(torch.tensor([0]), torch.tensor([0]))
+    game.place(torch.tensor([0]), torch.tensor([0]))
+    solid = orientation.observe(game, ("solid",))["solid"]
+    assert solid[0].tolist() == [[True, True], [True, True], [False, False], [True, True]]
+    assert torch.equal(
+        input_planes(orientation.observe(game, ("solid",)), ["solid"])[0, 4], solid[0].float()
+    )
 
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:

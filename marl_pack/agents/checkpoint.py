@@ -29,7 +29,7 @@ from marl_pack.agents.heuristics import (
     make_placement_agent,
     make_policy,
 )
-from marl_pack.agents.model import Actor, make_actor
+from marl_pack.agents.model import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.policy import (
     Choice,
     OrientationAgent,
@@ -125,6 +125,19 @@ def load_actor(found: Mapping[str, Any], name: str, device: torch.device | str) 
     except (RuntimeError, TypeError, KeyError) as error:
         raise ValueError(f"the {name} agent's weights do not fit its network: {error}") from None
     return actor.eval()
+
+
+def load_critic(found: Mapping[str, Any], name: str, device: torch.device | str) -> Critic:
+    """The critic of one agent. Arguments and errors as for :func:`load_actor`."""
+    actor = load_actor(found, name, device)
+    agent = found["agents"][name]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            critic = make_critic(name, agent["network"], device, actor)
+        critic.load_state_dict(agent["critic_state_dict"])
+    except (RuntimeError, KeyError) as error:
+        raise ValueError(f"the {name} agent has no critic that fits: {error}") from None
+    return critic.eval()
 
 
 def _best(actor: Actor, seen: Mapping[str, Tensor]) -> Tensor:

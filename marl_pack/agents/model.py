@@ -98,3 +98,12 @@ class Critic(MLPModel):
 def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | str) -> Actor:
     """An actor with fresh weights, to load a checkpoint into."""
     return Actor({}, {"actor": []}, "actor", 1, agent=agent, network=network).to(device)
+
+
+def make_critic(
+    agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor | None = None
+) -> Critic:
+    """A critic with fresh weights; one that shares its actor's trunk needs that actor."""
+    trunk = actor.cnns if actor is not None and network["share_trunk"] else None
+    critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
+    return critic.to(device)

@@ -22,12 +22,12 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
 
     Args:
         game: the bins.
-        planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`), each for all orientations.
+        planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`), for all orientations.
 
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
         ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
-        ``rest`` int16, ``waste`` int32 [N, 6, W, D].
+        ``rest`` int16, ``waste`` int32 [N, 6, W, D], ``solid`` bool [N, W, D].
     """
     seen = {
         "heightmap": game.bins.heightmap.clone(),
@@ -37,16 +37,17 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
     }
     if "mask" in planes:
         seen["cells"] = game.mask
-    if "rest" in planes or "waste" in planes:
-        sides = game.candidates(game.items, game.weights).sides
-        seen |= under(game, sides, planes)
-    return seen
+    sides = game.candidates(game.items, game.weights).sides
+    return seen | under(game, sides, planes)
 
 
 def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tensor]:
-    """The planes ``rest`` and ``waste`` that are asked for, for boxes of ``sides`` [N, A, 3]."""
-    rest, waste = rest_and_waste(game.bins, sides, waste="waste" in planes)
-    made = {"rest": rest, "waste": waste}
+    """What the planes but ``mask`` need that are asked for, for boxes of ``sides`` [N, A, 3]."""
+    made: dict[str, Tensor] = {}
+    if "rest" in planes or "waste" in planes:
+        made["rest"], made["waste"] = rest_and_waste(game.bins, sides, waste="waste" in planes)
+    if "solid" in planes:
+        made["solid"] = game.bins.empty_map == 0
     return {name: made[name] for name in planes if name in made}
 
 

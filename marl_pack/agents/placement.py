@@ -34,7 +34,7 @@ def observe(
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its sides along x, y, z),
         ``height`` int16 [N, 1], ``mask`` bool [N, W · D], and what the planes need: ``cells``
-        bool, ``rest`` int16, ``waste`` int32 [N, 1, W, D].
+        bool, ``rest`` int16, ``waste`` int32 [N, 1, W, D], ``solid`` bool [N, W, D].
     """
     oriented = game.orient(orientation)
     seen = {
@@ -45,9 +45,7 @@ def observe(
     }
     if "mask" in planes:
         seen["cells"] = oriented.mask[:, None]
-    if "rest" in planes or "waste" in planes:
-        seen |= under(game, oriented.sides[:, None], planes)
-    return seen
+    return seen | under(game, oriented.sides[:, None], planes)
 
 
 def make_head(network: Network) -> nn.Module:

@@ -86,11 +86,14 @@ def transform(
         x[None, :, None].expand(size, width, depth), y[None, None, :].expand(size, width, depth)
     )
     one = torch.ones((), dtype=torch.int64, device=device)
-    seen["heightmap"] = heightmap[
+    old_cell = (
         b[:, None, None],
         mirrored(from_x, one, width, flip_x[:, None, None]),
         mirrored(from_y, one, depth, flip_y[:, None, None]),
-    ]
+    )
+    for name in ("heightmap", "solid"):
+        if name in seen:
+            seen[name] = seen[name][old_cell]
     way = torch.arange(ways, device=device).expand(size, ways)
     if ways > 1:
         way = torch.where(swap[:, None], way ^ 1, way)

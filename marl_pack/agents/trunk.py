@@ -13,9 +13,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-PLANES = ("mask", "rest", "waste")
-"""Extra planes a network may see, for each orientation its agent has to judge: the cells where the
-item may be set down, its resting height at every cell, and the space it would enclose there."""
+PLANES = ("mask", "rest", "waste", "solid")
+"""Extra planes a network may see. For each orientation its agent has to judge: the cells where the
+item may be set down, its resting height at every cell, and the space it would enclose there. Once:
+the columns that are filled to the floor, which is what ``hull_alpha`` rests on."""
 
 
 @dataclass
@@ -27,7 +28,8 @@ class Network:
         layers: number of its 3 × 3 convolutions.
         residual: whether each convolution after the first adds to its input.
         context: whether features pooled over the whole bin are added to every cell's.
-        planes: what is seen beside the paper's four channels: any of mask, rest, waste.
+        planes: what is seen beside the paper's four channels: any of mask, rest, waste,
+            solid.
         hidden: units of the hidden layer in the heads that follow pooling.
         share_trunk: whether the critic looks at the actor's features or has a trunk of its own.
     """
@@ -36,7 +38,7 @@ class Network:
     layers: int = 3
     residual: bool = True
     context: bool = False
-    planes: list[str] = field(default_factory=lambda: list(PLANES))
+    planes: list[str] = field(default_factory=lambda: ["mask", "rest", "waste"])
     hidden: int = 64
     share_trunk: bool = True
 
@@ -50,11 +52,12 @@ class Network:
 
 
 def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor:
-    """The paper's four channels and the extra planes, float32 [B, 4 + A · len(planes), W, D].
+    """The paper's four channels and the extra planes, float32 [B, :func:`count_planes`, W, D].
 
     Args:
         observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
-            and for the extra planes ``cells`` bool, ``rest`` int or ``waste`` int [B, A, W, D].
+            and for the extra planes ``cells`` bool, ``rest`` int or ``waste`` int [B, A, W, D],
+            ``solid`` bool [B, W, D].
         planes: which of :data:`PLANES`.
 
     Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
@@ -71,9 +74,16 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
             seen.append(observation["cells"].float())
         elif plane == "rest":
             seen.append(observation["rest"].float() / height[:, :, None, None])
+        elif plane == "solid":
+            seen.append(observation["solid"].float()[:, None])
         else:
             seen.append(observation["waste"].float() / (item.prod(1) + 1)[:, None, None, None])
     return torch.cat(seen, 1).contiguous(memory_format=torch.channels_last)
+
+
+def count_planes(planes: list[str], ways: int) -> int:
+    """Channels that :func:`input_planes` makes for A = ``ways`` orientations."""
+    return 4 + sum(1 if plane == "solid" else ways for plane in planes)
 
 
 def pool(features: Tensor) -> Tensor:
@@ -95,7 +105,7 @@ class Trunk(nn.Module):
         super().__init__()
         self.planes, self.residual = list(network.planes), network.residual
         channels = network.channels
-        wide = [4 + ways * len(self.planes)] + [channels] * network.layers
+        wide = [count_planes(self.planes, ways)] + [channels] * network.layers
         self.convolutions = nn.ModuleList(
             initialized(nn.Conv2d(a, b, 3, padding=1)) for a, b in pairwise(wide)
         )
