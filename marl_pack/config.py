@@ -183,6 +183,8 @@ class Config:
         threads: threads of torch on the CPU.
         joint: one agent that chooses the pair (orientation, cell) in place of the two; its network
             is placement.network.
+        init: a run's folder or checkpoint whose weights the learning agents begin with; null for
+            fresh ones.
         game: the game.
         orientation: the agent that turns the item.
         placement: the agent that sets it down.
@@ -195,6 +197,7 @@ class Config:
     device: str = "cpu"
     threads: int = 1
     joint: bool = False
+    init: str | None = None
     game: Game = field(default_factory=Game)
     orientation: Agent = field(default_factory=Agent)
     placement: Agent = field(default_factory=Agent)

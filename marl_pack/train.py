@@ -186,6 +186,8 @@ def make_runner(
         torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
         if found is not None:
             runner.resume(found)
+        elif config.init is not None:
+            runner.begin_with(checkpoint.read(config.init, device))
     except (ValueError, FileNotFoundError) as error:
         raise ConfigError(str(error)) from None
     return runner

@@ -209,6 +209,27 @@ def test_a_run_takes_over_no_folder_and_leaves_none_behind_that_it_did_not_use(
     assert main([*SMALL, f"--output.folder={tmp_path / 'file'}"]) == 2
 
 
+def test_a_run_begins_with_the_weights_of_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
+    first = networks(tmp_path / "run")
+    again = (*SMALL, f"--init={tmp_path / 'run'}", f"--output.folder={tmp_path / 'again'}")
+    assert main([*again, "--ppo.max_iterations=1", "--ppo.learning_rate=1e-12"]) == 0
+    second = networks(tmp_path / "again" / "run")
+    assert all(torch.allclose(first[name], second[name], atol=1e-9) for name in first)
+    assert checkpoint.read(tmp_path / "again" / "run")["items"] == 32  # its own alone
+    capsys.readouterr()
+    assert main([*again, "--orientation.network.layers=2", "--output.name=other"]) == 2
+    assert "orientation agent has another network: {'layers': 3}" in capsys.readouterr().err
+    frozen = ("--placement.frozen=true", "--placement.policy=dblf", "--output.name=frozen")
+    assert main([*SMALL, *frozen, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]) == 0
+    capsys.readouterr()
+    init = f"--init={tmp_path / 'frozen'}"
+    assert main([*SMALL, init, "--output.name=x", f"--output.folder={tmp_path}"]) == 2
+    assert "no placement agent that has learned" in capsys.readouterr().err
+
+
 def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:
     """A checkpoint is there before the first iteration, and on resuming holds what is new."""
     begun: list[int] = []

@@ -259,6 +259,27 @@ class Runner(OnPolicyRunner):
         infos: dict[str, Any] | None = found.get("infos")
         return infos
 
+    def begin_with(self, found: Mapping[str, Any]) -> None:
+        """Take the learners' weights from another run; nothing else of it.
+
+        Args:
+            found: what :func:`marl_pack.agents.checkpoint.read` gave.
+
+        Raises:
+            ValueError: if an agent that learns here did not there, or has another network.
+        """
+        for name, ppo in self.alg.learners.items():
+            agent = found["agents"].get(name, {})
+            if "network" not in agent:
+                raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
+            mine = self.cfg["agents"][name]["network"]
+            if other := {k: v for k, v in agent["network"].items() if mine.get(k) != v}:
+                raise ValueError(
+                    f"init: the checkpoint's {name} agent has another network: {other}"
+                )
+            ppo.actor.load_state_dict(agent["actor_state_dict"])
+            ppo.critic.load_state_dict(agent["critic_state_dict"])
+
     def resume(self, found: Mapping[str, Any]) -> None:
         """Go on exactly from the checkpoint of a run with the same settings.
 
