@@ -5,7 +5,7 @@ import torch
 
 from marl_pack.agents import joint, orientation, placement
 from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor
-from marl_pack.agents.trunk import PLANES, Network, input_planes
+from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes
 from marl_pack.packing import Packing
 
 SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
@@ -56,6 +56,21 @@ def test_solid_are_the_columns_without_a_gap() -> None:
     assert torch.equal(
         input_planes(orientation.observe(game, ("solid",)), ["solid"])[0, 4], solid[0].float()
     )
+
+
+@pytest.mark.parametrize(("dilation", "far"), [(1, 3), (2, 5)])
+def test_three_layers_look_as_far_as_their_dilation_lets_them(dilation: int, far: int) -> None:
+    trunk = Trunk(1, Network(channels=4, planes=[], dilation=dilation))
+    seen = {
+        "heightmap": torch.zeros(1, 15, 15),
+        "item": torch.ones(1, 3),
+        "height": torch.full((1, 1), 10),
+    }
+    flat = trunk(seen)
+    seen["heightmap"][0, 7, 7] = 5
+    changed = (trunk(seen) != flat).any(1)[0].nonzero()
+    assert changed.min(0).values.tolist() == [7 - far, 7 - far]
+    assert changed.max(0).values.tolist() == [7 + far, 7 + far]
 
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:

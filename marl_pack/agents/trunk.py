@@ -27,6 +27,8 @@ class Network:
         channels: feature planes of the convolutional trunk.
         layers: number of its 3 × 3 convolutions.
         residual: whether each convolution after the first adds to its input.
+        dilation: cells between the taps of each convolution after the first; with 2, three layers
+            look 5 cells far in place of 3.
         context: whether features pooled over the whole bin are added to every cell's.
         planes: what is seen beside the paper's four channels: any of mask, rest, waste,
             solid.
@@ -37,13 +39,14 @@ class Network:
     channels: int = 32
     layers: int = 3
     residual: bool = True
+    dilation: int = 1
     context: bool = False
     planes: list[str] = field(default_factory=lambda: ["mask", "rest", "waste"])
     hidden: int = 64
     share_trunk: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("channels", "layers", "hidden"):
+        for name in ("channels", "layers", "dilation", "hidden"):
             if getattr(self, name) < 1:
                 raise ValueError(f"network: {name} = {getattr(self, name)}, needs 1 or more")
         unknown = [plane for plane in self.planes if plane not in PLANES]
@@ -106,8 +109,10 @@ class Trunk(nn.Module):
         self.planes, self.residual = list(network.planes), network.residual
         channels = network.channels
         wide = [count_planes(self.planes, ways)] + [channels] * network.layers
+        apart = [1] + [network.dilation] * (network.layers - 1)
         self.convolutions = nn.ModuleList(
-            initialized(nn.Conv2d(a, b, 3, padding=1)) for a, b in pairwise(wide)
+            initialized(nn.Conv2d(a, b, 3, padding=d, dilation=d))
+            for (a, b), d in zip(pairwise(wide), apart, strict=True)
         )
         self.context = initialized(nn.Linear(2 * channels, channels)) if network.context else None
         # (observation, its features), kept from the actor for the critic that shares this trunk.
