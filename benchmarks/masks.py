@@ -80,7 +80,7 @@ def against_the_literal_reading(states: int = 32) -> None:
         levels = np.empty((1, *size[:2]), hull_cpu.level_dtype(size[2]))
         out = np.empty((1, 1, *size[:2]), np.uint8)
         maps = bins.heightmap.numpy(), bins.empty_map.numpy()
-        arguments = (*maps, item.sides.numpy(), size[2], levels, out)
+        arguments = (*maps, item.sides.numpy(), size[2], levels, out, levels[:0, None])
         seconds["kernel"] += best_time(lambda a=arguments: hull_cpu.hull_mask(*a))  # type: ignore[misc]  # bound now
         flat = (*(m.ravel() for m in maps), levels.ravel())
         seconds["levels"] += best_time(lambda a=flat: hull_cpu.fill_levels(*a))  # type: ignore[misc]  # bound now

@@ -71,8 +71,8 @@ class Agent:
 
     Args:
         frozen: whether it plays without learning.
-        policy: who plays a frozen agent: random, dblf, height_min, best_fit, for the orientation
-            agent also first (as the item comes), or a run's folder or checkpoint.
+        policy: who plays a frozen agent: random, dblf, height_min, best_fit, most_room, for the
+            orientation agent also first (as the item comes), or a run's folder or checkpoint.
         network: shape of its network.
         learning_rate: the agent's own, in place of ppo.learning_rate; null for that.
         entropy_coef: the agent's own, in place of ppo.entropy_coef; null for that.

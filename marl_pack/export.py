@@ -72,6 +72,9 @@ def example(agent: str, planes: Sequence[str], batch: int, size: tuple[int, int,
         seen["rest"] = draw(height, *shape)
     if "waste" in planes:
         seen["waste"] = draw(20, *shape)
+    for plane in ("room", "fits"):
+        if plane in planes:
+            seen[plane] = torch.rand(shape, generator=generator)
     if "solid" in planes:
         seen["solid"] = torch.ones(batch, width, depth, dtype=torch.bool)
     return seen
@@ -82,8 +85,8 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 
     Inputs are the groups of the agent's ``observe``, whole numbers as int64: ``heightmap``
     [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and ``cells`` bool,
-    ``rest``, ``waste`` [B, A, W, D], ``solid`` bool [B, W, D] where its network has these planes.
-    Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
+    ``rest``, ``waste``, float32 ``room``, ``fits`` [B, A, W, D], ``solid`` bool [B, W, D] where its
+    network has these planes. Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
 
     Returns:
         The names of the inputs.
@@ -101,7 +104,7 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
         "height": {0: batch},
         "mask": {0: batch} if agent == "orientation" else {0: batch, 1: actions},
     }
-    for plane in ("cells", "rest", "waste"):
+    for plane in ("cells", "rest", "waste", "room", "fits"):
         shapes[plane] = {0: batch, 2: width, 3: depth}
     shapes["solid"] = shapes["heightmap"]
     with warnings.catch_warnings():

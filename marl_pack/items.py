@@ -44,6 +44,11 @@ class Stream(Protocol):
         ...
 
     @property
+    def sides(self) -> tuple[int, int]:
+        """Shortest and longest side that an item may have."""
+        ...
+
+    @property
     def episodes(self) -> int | None:
         """How many different episodes there are; None if there is no end of them."""
         ...
@@ -139,6 +144,11 @@ class Uniform:
     def smallest(self) -> int:
         """Volume of the smallest type."""
         return self.low**3
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Shortest and longest side."""
+        return self.low, self.high
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """The episodes' keys, int64 [K]."""
@@ -286,6 +296,11 @@ class Cut:
         return self.low**3
 
     @property
+    def sides(self) -> tuple[int, int]:
+        """Shortest and longest side of a piece."""
+        return self.low, self.high
+
+    @property
     def longest(self) -> int:
         """As many pieces as fit if all are the smallest."""
         return int(np.prod([s // self.low for s in self.size]))
@@ -338,6 +353,11 @@ class Sequences:
         """Volume of the smallest item."""
         volume = self.items.long().prod(2)
         return int(volume[volume > 0].min())
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Shortest and longest side of any item."""
+        return int(self.items[self.items > 0].min()), int(self.items.max())
 
     @property
     def episodes(self) -> int:

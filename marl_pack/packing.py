@@ -25,6 +25,7 @@ from marl_pack.bins import ORIENTATIONS, check_device, check_size
 from marl_pack.items import DEFAULT_SIDES, Stream, fingerprint, make_stream
 from marl_pack.stability import Candidates, Rule, candidates, make_rule
 from marl_pack.stability.candidates import NO_OFFSET, check_com_offset
+from marl_pack.stability.room import probe_lengths, room_left
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
 
@@ -158,6 +159,8 @@ class Packing:
             most = min(most, self.stream.longest)
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
+        self._lengths = probe_lengths(*self.stream.sides)
+        self._room: tuple[Tensor, ...] | None = None
         self.reset(seed, first_episode)
 
     def reset(self, seed: int | None = None, first_episode: int = 0) -> None:
@@ -177,6 +180,17 @@ class Packing:
         self._look()
         if self.auto_reset:
             self._begin((~self.alive).nonzero().squeeze(1))
+
+    def room(self) -> tuple[Tensor, ...]:
+        """What each legal placement would leave for the items that may come next.
+
+        Both numbers of :func:`marl_pack.stability.room.room_left`, float32 [N, 6, W, D], for boxes
+        with sides between the stream's shortest and longest; made once a turn.
+        """
+        if self._room is None:
+            sides = self.candidates(self.items, self.weights).sides
+            self._room = room_left(self.bins, sides, self.mask, self._lengths, self.orientations)
+        return self._room
 
     def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:
         """Bool [N, 6, W, D]: where ``items`` [N, 3] may be set down in ``bins``, each way."""
@@ -264,6 +278,7 @@ class Packing:
         game.n, game.auto_reset = len(which), False
         game._index = torch.arange(len(which), device=self.device)
         game.bins, game.bin_height = self.bins[which], self.bin_height[which]
+        game._room = None if self._room is None else tuple(made[which] for made in self._room)
         for name in ("items", "weights", "mask", "orientation_mask", "alive", "lost", "t"):
             setattr(game, name, getattr(self, name)[which])
         if stream is None:
@@ -325,6 +340,7 @@ class Packing:
 
     def _look(self) -> None:
         """Make the masks of the items that have come; a bin where none is legal has ended."""
+        self._room = None
         self.mask = self.masks(self.bins, self.items, self.weights)
         if not self.mask_orientations:
             self.mask &= ~self.lost[:, None, None, None]

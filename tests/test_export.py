@@ -40,10 +40,10 @@ def test_an_exported_agent_agrees_with_pytorch(
             seen = (joint if agent == "joint" else orientation).observe(game, planes)
         with torch.inference_mode():
             action, probabilities = Exported(actor, names)(*(seen[name] for name in names))
-        given = {
-            name: seen[name].numpy() if seen[name].dtype == torch.bool else
-            seen[name].numpy().astype(np.int64) for name in names
-        }  # fmt: skip
+        given = {name: seen[name].numpy() for name in names}
+        for name, values in given.items():
+            if np.issubdtype(values.dtype, np.integer):
+                given[name] = values.astype(np.int64)
         out = session.run(["action", "probabilities"], given)
         assert np.array_equal(out[0], action.numpy())
         np.testing.assert_allclose(out[1], probabilities.numpy(), atol=1e-5)

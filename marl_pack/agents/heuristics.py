@@ -22,6 +22,7 @@ from marl_pack.agents.policy import (
 )
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.packing import Packing
+from marl_pack.stability.room import MOST_LENGTHS
 from marl_pack.stability.windows import rest_and_waste
 
 
@@ -96,10 +97,30 @@ def best_fit(game: Packing, mask: Tensor | None = None) -> Choice:
     )
 
 
+def most_room(game: Packing, mask: Tensor | None = None) -> Choice:
+    """The placement that leaves the next item most: see :meth:`Packing.room`.
+
+    Greatest mean number of cells where a box that may come next could be set down, then the lowest
+    top, then x + y.
+    """
+    v = _view(game)
+    width, depth, height = v.size
+    most = width * depth * MOST_LENGTHS**3
+    room = (game.room()[0].double() * MOST_LENGTHS**3).round().long()
+    return _least(
+        game,
+        mask,
+        (most - room, most + 1),
+        ((v.z + v.h).clamp(max=height), height + 1),
+        (v.x + v.y, width + depth),
+    )
+
+
 HEURISTICS: dict[str, Callable[[Packing, Tensor | None], Choice]] = {
     "dblf": dblf,
     "height_min": height_min,
     "best_fit": best_fit,
+    "most_room": most_room,
 }
 """Name -> function of the game and of what may be chosen, all that is legal if None."""
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor, nn
 
 from marl_pack.agents.trunk import Network, pooled_head
@@ -27,7 +28,8 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
         ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
-        ``rest`` int16, ``waste`` int32 [N, 6, W, D], ``solid`` bool [N, W, D].
+        ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 6, W, D], ``solid`` bool
+        [N, W, D].
     """
     seen = {
         "heightmap": game.bins.heightmap.clone(),
@@ -38,17 +40,31 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
     if "mask" in planes:
         seen["cells"] = game.mask
     sides = game.candidates(game.items, game.weights).sides
-    return seen | under(game, sides, planes)
+    return seen | under(game, sides, planes) | ahead(game, planes)
 
 
 def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tensor]:
-    """What the planes but ``mask`` need that are asked for, for boxes of ``sides`` [N, A, 3]."""
+    """What those planes need that look under boxes of ``sides`` [N, A, 3]."""
     made: dict[str, Tensor] = {}
     if "rest" in planes or "waste" in planes:
         made["rest"], made["waste"] = rest_and_waste(game.bins, sides, waste="waste" in planes)
     if "solid" in planes:
         made["solid"] = game.bins.empty_map == 0
     return {name: made[name] for name in planes if name in made}
+
+
+def ahead(
+    game: Packing, planes: Sequence[str], orientation: Tensor | None = None
+) -> dict[str, Tensor]:
+    """What the planes ``room`` and ``fits`` need if asked for: all ways, or the one chosen [N]."""
+    wanted = [name for name in ("room", "fits") if name in planes]
+    if not wanted:
+        return {}
+    made = dict(zip(("room", "fits"), game.room(), strict=True))
+    if orientation is not None:
+        rows = torch.arange(game.n, device=game.device)
+        made = {name: values[rows, orientation][:, None] for name, values in made.items()}
+    return {name: made[name] for name in wanted}
 
 
 def make_head(network: Network) -> nn.Module:

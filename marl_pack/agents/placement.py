@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from marl_pack.agents.orientation import under
+from marl_pack.agents.orientation import ahead, under
 from marl_pack.agents.trunk import Network, ScoreMap
 from marl_pack.packing import Packing
 
@@ -34,7 +34,8 @@ def observe(
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its sides along x, y, z),
         ``height`` int16 [N, 1], ``mask`` bool [N, W · D], and what the planes need: ``cells``
-        bool, ``rest`` int16, ``waste`` int32 [N, 1, W, D], ``solid`` bool [N, W, D].
+        bool, ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 1, W, D],
+        ``solid`` bool [N, W, D].
     """
     oriented = game.orient(orientation)
     seen = {
@@ -45,7 +46,8 @@ def observe(
     }
     if "mask" in planes:
         seen["cells"] = oriented.mask[:, None]
-    return seen | under(game, oriented.sides[:, None], planes)
+    found = under(game, oriented.sides[:, None], planes)
+    return seen | found | ahead(game, planes, orientation)
 
 
 def make_head(network: Network) -> nn.Module:

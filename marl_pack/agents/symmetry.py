@@ -15,7 +15,13 @@ from torch import Tensor
 
 from marl_pack.bins import oriented
 
-MAPS = ("cells", "rest", "waste")  # observations [B, A, W, D] that lie at low corners
+MAPS = (
+    "cells",
+    "rest",
+    "waste",
+    "room",
+    "fits",
+)  # observations [B, A, W, D] that lie at low corners
 
 
 def see_through_symmetries(ppo: PPO, agent: str) -> None:

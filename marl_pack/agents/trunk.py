@@ -13,10 +13,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-PLANES = ("mask", "rest", "waste", "solid")
+PLANES = ("mask", "rest", "waste", "room", "fits", "solid")
 """Extra planes a network may see. For each orientation its agent has to judge: the cells where the
-item may be set down, its resting height at every cell, and the space it would enclose there. Once:
-the columns that are filled to the floor, which is what ``hull_alpha`` rests on."""
+item may be set down, its resting height at every cell, the space it would enclose there, and what
+each placement would leave: in how many cells the next item may be set down in the mean, and how
+probable it is that it finds a place (:mod:`marl_pack.stability.room`). Once: the columns that are
+filled to the floor, which is what ``hull_alpha`` rests on."""
 
 
 @dataclass
@@ -30,8 +32,8 @@ class Network:
         dilation: cells between the taps of each convolution after the first; with 2, three layers
             look 5 cells far in place of 3.
         context: whether features pooled over the whole bin are added to every cell's.
-        planes: what is seen beside the paper's four channels: any of mask, rest, waste,
-            solid.
+        planes: what is seen beside the paper's four channels: any of mask, rest, waste, room,
+            fits, solid.
         hidden: units of the hidden layer in the heads that follow pooling.
         share_trunk: whether the critic looks at the actor's features or has a trunk of its own.
     """
@@ -59,12 +61,13 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
 
     Args:
         observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
-            and for the extra planes ``cells`` bool, ``rest`` int or ``waste`` int [B, A, W, D],
-            ``solid`` bool [B, W, D].
+            and for the extra planes ``cells`` bool, ``rest`` int, ``waste`` int, ``room`` float or
+            ``fits`` float [B, A, W, D], ``solid`` bool [B, W, D].
         planes: which of :data:`PLANES`.
 
     Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
-    share of the item's own volume, so that the planes mean the same in every bin.
+    share of the item's own volume, so that the planes mean the same in every bin. Of the room the
+    logarithm is seen, since cells count most where few are left.
     """
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]
@@ -77,6 +80,10 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
             seen.append(observation["cells"].float())
         elif plane == "rest":
             seen.append(observation["rest"].float() / height[:, :, None, None])
+        elif plane == "room":
+            seen.append(observation["room"].log1p())
+        elif plane == "fits":
+            seen.append(observation["fits"])
         elif plane == "solid":
             seen.append(observation["solid"].float()[:, None])
         else:

@@ -336,7 +336,9 @@ def _write_mask(codes: Any, out: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def hull_mask(heightmap: Any, hollow: Any, sides: Any, height: int, levels: Any, out: Any) -> None:
+def hull_mask(
+    heightmap: Any, hollow: Any, sides: Any, height: int, levels: Any, out: Any, best_level: Any
+) -> None:
     """Masks of boxes with central mass and no margin; see :func:`hull_mask_general`.
 
     Args:
@@ -346,6 +348,8 @@ def hull_mask(heightmap: Any, hollow: Any, sides: Any, height: int, levels: Any,
         height: H, at most 16383 cells (126 where ``levels`` is uint8).
         levels: uint8 or int16 [N, W, D], scratch.
         out: uint8 [N, A, W, D], written: 1 where the candidate fits and stands.
+        best_level: as ``levels`` [N, A, W, D], written where ``out`` is 1: K under the candidate;
+            without entries if nobody wants to know.
     """
     n, width, depth = heightmap.shape
     ways = sides.shape[1]
@@ -402,9 +406,15 @@ def hull_mask(heightmap: Any, hollow: Any, sides: Any, height: int, levels: Any,
                     codes[j], tops[j * cells : (j + 1) * cells], levels[i // ways], w, d, w / 2,
                     d / 2, 0.0, scratch, out[i // ways, i % ways],
                 )  # fmt: skip
+            if best_level.size:
+                own = tops[j * cells : (j + 1) * cells]
+                _copy(own, best_level[i // ways, i % ways].reshape(cells))
     for i in range(n * ways):
         if twin[i] >= 0:
             _copy(flat_out[twin[i]], flat_out[i])
+            if best_level.size:
+                own = best_level[twin[i] // ways, twin[i] % ways].reshape(cells)
+                _copy(own, best_level[i // ways, i % ways].reshape(cells))
 
 
 @njit(cache=True, nogil=True)
@@ -496,7 +506,8 @@ def support_mask(
     out = np.empty((n, sides.shape[1], width, depth), np.uint8)
     levels = np.empty(heightmap.shape, level_dtype(height))
     if com is None and margin == 0:
-        hull_mask(heightmap, hollow, sides, height, levels, out)
+        nobody = np.empty((0, 0, 0, 0), levels.dtype)
+        hull_mask(heightmap, hollow, sides, height, levels, out, nobody)
     else:
         middle = np.ascontiguousarray(sides[..., :2] / 2 if com is None else com)
         hull_mask_general(heightmap, hollow, sides, middle, margin, height, levels, out)

@@ -1,0 +1,117 @@
+"""Utilization against how different the items are: the paper's figure on the RS test sequences.
+
+``python -m benchmarks.volume_spread CHECKPOINT --items rs.npz`` plays every sequence, groups the
+episodes by the standard deviation of the volumes of their sequence's items and draws the mean
+utilization of each group with its 95 % interval, beside the rank correlation over all episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+
+from benchmarks.timing import show
+from marl_pack import evaluate
+from marl_pack.agents import checkpoint
+from marl_pack.agents.heuristics import POLICIES, make_policy
+from marl_pack.items import Size, Stream, choose_stream
+from marl_pack.packing import Packing
+
+GROUPS = 8
+
+
+def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float64]:
+    """Standard deviation of the item volumes of each sequence, cells³ [E].
+
+    Args:
+        stream: a file's sequences, of which all items count.
+        episodes: E.
+        seed: of the stream.
+    """
+    state = stream.start(seed, torch.arange(episodes))
+    longest = stream.longest
+    if longest is None:
+        raise ValueError("the sequences have no end: give a file of items")
+    volumes = []
+    for t in range(longest):
+        sides, _ = stream.item(state, torch.full((episodes,), t))
+        volumes.append(sides.long().prod(1))
+    found = torch.stack(volumes, 1).double()
+    found[found == 0] = torch.nan  # past the end of its sequence
+    return np.nanstd(found.numpy(), axis=1, ddof=1)
+
+
+def play(policy: str, stream: Stream, size: Size, episodes: int) -> NDArray[np.float64]:
+    """Utilization of each episode [E]."""
+    chosen = (
+        make_policy(policy) if policy in POLICIES
+        else checkpoint.load_policy(checkpoint.read(policy), "cpu", 0)
+    )  # fmt: skip
+
+    def game(n: int, first: int) -> Packing:
+        return Packing(n, size, stream, auto_reset=False, first_episode=first)
+
+    reached: NDArray[np.float64] = evaluate.play(chosen, game, episodes).utilization
+    return reached
+
+
+def main() -> None:
+    """The picture and the table."""
+    options = argparse.ArgumentParser(prog="python -m benchmarks.volume_spread")
+    options.add_argument("policies", nargs="+", help="checkpoints, runs' folders or heuristics")
+    options.add_argument("--items", required=True, help="a file of sequences")
+    options.add_argument("--picture", type=Path, default=Path("docs/volume_spread.png"))
+    chosen = options.parse_args()
+    torch.set_num_threads(1)
+    stream, size = choose_stream(chosen.items, None, (2, 5))
+    assert stream.episodes is not None, "a file's sequences are counted"
+    spread = volume_spread(stream, stream.episodes, 0)
+    edges = np.quantile(spread, np.linspace(0, 1, GROUPS + 1))
+    group = np.clip(np.searchsorted(edges, spread, side="right") - 1, 0, GROUPS - 1)
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panel = plt.subplots(figsize=(7, 4), layout="constrained")
+    table: list[list[Any]] = []
+    for p, policy in enumerate(chosen.policies):
+        reached = 100 * play(policy, stream, size, stream.episodes)
+        name = policy if policy in POLICIES else Path(policy).stem
+        panel.scatter(spread, reached, s=2, alpha=0.15, color=f"C{p}")
+        middle, mean, half = [], [], []
+        for k in range(GROUPS):
+            own = reached[group == k]
+            low, high = evaluate.interval(own) or (np.nan, np.nan)
+            middle.append(np.median(spread[group == k]))
+            mean.append(own.mean())
+            half.append((high - low) / 2)
+        panel.errorbar(middle, mean, half, marker="o", markersize=3, capsize=2, label=name,
+                       color=f"C{p}")  # fmt: skip
+        found = stats.spearmanr(spread, reached)
+        slope = stats.linregress(spread, reached)
+        table.append(
+            [name, f"{found.statistic:+.3f} (p = {found.pvalue:.2g})",
+             f"{10 * slope.slope:+.2f} ± {19.6 * slope.stderr:.2f}",
+             f"{mean[0]:.1f}", f"{mean[-1]:.1f}"]
+        )  # fmt: skip
+    panel.set_xlabel("standard deviation of the item volumes of a sequence, cells")
+    panel.set_ylabel("utilization, %")
+    panel.grid(alpha=0.3)
+    panel.legend(loc="lower left")
+    figure.savefig(chosen.picture, dpi=120)
+    show(
+        f"{stream.episodes} sequences",
+        ["policy", "rank correlation", "points per 10 cells", "first eighth", "last eighth"],
+        table,
+    )
+
+
+if __name__ == "__main__":
+    main()

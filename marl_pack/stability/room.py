@@ -1,0 +1,229 @@
+"""How much room each placement would leave for what may come next.
+
+For every legal window of the visible item, the item is set down there in thought and ``hull_alpha``
+asked where the boxes that may come next could then stand. Two numbers come of it: in how many cells
+such a box may be set down in the mean, and how probable it is that the next item finds a place at
+all. What may come is every box whose sides are of given lengths, each as probable as the other.
+
+On the CPU compiled loops, elsewhere tensor code; both give the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from marl_pack.bins import ORIENTATIONS, Bins, compiled, footprint
+from marl_pack.stability import hull_cpu, hull_torch
+
+MOST_LENGTHS = 5
+"""Of so many lengths of a side boxes are made at most."""
+AT_ONCE = 1 << 20  # cells of masks made at once
+
+
+def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
+    """At most :data:`MOST_LENGTHS` lengths from ``shortest`` to ``longest``, evenly spread."""
+    count = min(MOST_LENGTHS, longest - shortest + 1)
+    return tuple(round(x) for x in np.linspace(shortest, longest, count))
+
+
+def room_left(
+    bins: Bins,
+    sides: Tensor,
+    mask: Tensor,
+    lengths: Sequence[int],
+    orientations: Sequence[int] = tuple(range(len(ORIENTATIONS))),
+) -> tuple[Tensor, Tensor]:
+    """What each legal placement would leave.
+
+    Args:
+        bins: N bins.
+        sides: int16 [N, A, 3], the item's sides along x, y, z in A orientations.
+        mask: bool [N, A, W, D], where it may be set down.
+        lengths: ascending; what may come next has sides of these lengths.
+        orientations: indices into :data:`marl_pack.bins.ORIENTATIONS` in which the next item may be
+            set down.
+
+    Returns:
+        float32 [N, A, W, D], the mean number of cells where a box that may come could be set down
+        after this placement; and float32 [N, A, W, D], the probability that the next item finds a
+        place. 0 where the mask is false.
+    """
+    code = _room_cpu if compiled(bins.device) else _room_torch
+    return code(bins, sides, mask, tuple(lengths), tuple(orientations))
+
+
+# --- compiled -------------------------------------------------------------------------------------
+
+
+@njit(cache=True, inline="always")
+def _same(sides: Any, b: int, a: int, e: int) -> bool:
+    return bool(
+        sides[b, a, 0] == sides[b, e, 0]
+        and sides[b, a, 1] == sides[b, e, 1]
+        and sides[b, a, 2] == sides[b, e, 2]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _placements(mask: Any, sides: Any) -> Any:
+    """Bin, orientation and cell of every legal placement, int64 [K, 4]; none that has a twin."""
+    n, ways, width, depth = mask.shape
+    found = np.empty((mask.size, 4), np.int64)
+    k = 0
+    for b in range(n):
+        for a in range(ways):
+            twin = False
+            for e in range(a):
+                twin |= _same(sides, b, a, e)
+            if twin:
+                continue
+            for x in range(width):
+                for y in range(depth):
+                    if mask[b, a, x, y]:
+                        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = b, a, x, y
+                        k += 1
+    return found[:k]
+
+
+@njit(cache=True, nogil=True)
+def _set_down(
+    heightmap: Any, empty_map: Any, sides: Any, placements: Any, heights: Any, hollow: Any
+) -> None:
+    """The maps after each placement [K, W, D]."""
+    width, depth = heightmap.shape[1:]
+    for k in range(placements.shape[0]):
+        b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
+        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
+        z = 0
+        for i in range(x, x + w):
+            for j in range(y, y + d):
+                z = max(z, heightmap[b, i, j])
+        for i in range(width):
+            for j in range(depth):
+                heights[k, i, j], hollow[k, i, j] = heightmap[b, i, j], empty_map[b, i, j]
+        for i in range(x, x + w):
+            for j in range(y, y + d):
+                hollow[k, i, j] += z - heightmap[b, i, j]
+                heights[k, i, j] = z + h
+
+
+@njit(cache=True, nogil=True)
+def _judge(
+    masks: Any, best_level: Any, fitting: Any, ways: Any, cells: Any, chance: Any
+) -> None:  # fmt: skip
+    """Both numbers of each placement.
+
+    Args:
+        masks, best_level: [K, L · L, W · D], of boxes of the least height on each footprint.
+        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
+        ways: int64 [A, 3], the orientations the next item may have.
+        cells, chance: float32 [K], written.
+    """
+    lengths = fitting[0]  # all fit above the floor
+    tallest = np.empty((lengths, lengths), np.int64)  # of how many lengths a box fits somewhere
+    item = np.empty(3, np.int64)
+    items = lengths**3
+    for k in range(masks.shape[0]):
+        total = 0
+        for p in range(masks.shape[1]):
+            most = 0
+            for c in range(masks.shape[2]):
+                if masks[k, p, c]:
+                    fit = fitting[best_level[k, p, c] >> 1]
+                    total += fit
+                    most = max(most, fit)
+            tallest[p // lengths, p % lengths] = most
+        cells[k] = total / items
+        found = 0
+        for i in range(items):
+            item[0], item[1], item[2] = i // lengths**2, i // lengths % lengths, i % lengths
+            for a in range(ways.shape[0]):
+                if tallest[item[ways[a, 0]], item[ways[a, 1]]] > item[ways[a, 2]]:
+                    found += 1
+                    break
+        chance[k] = found / items
+
+
+@njit(cache=True, nogil=True)
+def _write(sides: Any, placements: Any, cells: Any, chance: Any, room: Any, fits: Any) -> None:
+    """Put the numbers where they belong, twins' too."""
+    for k in range(placements.shape[0]):
+        b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
+        for e in range(a, sides.shape[1]):
+            if _same(sides, b, a, e):
+                room[b, e, x, y], fits[b, e, x, y] = cells[k], chance[k]
+
+
+def _room_cpu(
+    bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...], orientations: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    own = np.ascontiguousarray(sides.numpy())
+    placements = _placements(np.ascontiguousarray(mask.numpy()), own)
+    shape, count = bins.size[:2], len(placements)
+    footprints = [(w, d, lengths[0]) for w, d in product(lengths, repeat=2)]
+    most = min(count, max(1, AT_ONCE // (len(footprints) * shape[0] * shape[1])))
+    boxes = np.tile(np.array(footprints, np.int16), (most, 1, 1))
+    masks = np.empty((most, len(footprints), *shape), np.uint8)
+    levels = np.empty((most, *shape), hull_cpu.level_dtype(bins.height))
+    best_level = np.empty(masks.shape, levels.dtype)
+    maps = np.empty((2, most, *shape), np.int16)
+    free = bins.height - np.arange(bins.height + 1)
+    fitting = (np.array(lengths) <= free[:, None]).sum(1)
+    ways = np.array([ORIENTATIONS[o] for o in orientations])
+    cells, chance = np.empty((2, count), np.float32)
+    heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
+    for start in range(0, count, most or 1):
+        some = placements[start : start + most]
+        n = len(some)
+        _set_down(heightmap, empty_map, own, some, maps[0, :n], maps[1, :n])
+        hull_cpu.hull_mask(
+            maps[0, :n], maps[1, :n], boxes[:n], bins.height, levels[:n], masks[:n], best_level[:n]
+        )
+        _judge(
+            masks[:n].reshape(n, len(footprints), -1),
+            best_level[:n].reshape(n, len(footprints), -1),
+            fitting, ways, cells[start : start + n], chance[start : start + n],
+        )  # fmt: skip
+    room, fits = np.zeros((2, *mask.shape), np.float32)
+    _write(own, placements, cells, chance, room, fits)
+    return torch.from_numpy(room), torch.from_numpy(fits)
+
+
+# --- tensor code ----------------------------------------------------------------------------------
+
+
+def _room_torch(
+    bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...], orientations: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    width, depth, height = bins.size
+    device = bins.device
+    room = torch.zeros(mask.shape, device=device)
+    fits = torch.zeros(mask.shape, device=device)
+    boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16, device=device)
+    index = torch.arange(len(boxes), device=device).view([len(lengths)] * 3)
+    inverse = [sorted(range(3), key=ORIENTATIONS[o].__getitem__) for o in orientations]
+    turned = torch.stack([index.permute(axes).flatten() for axes in inverse], 1)
+    placements = mask.nonzero()
+    for some in torch.split(placements, max(1, AT_ONCE // (len(boxes) * width * depth))):
+        b, a, x, y = some.T
+        box = sides[b, a]
+        window = footprint(width, depth, box, x * depth + y)
+        heights = bins.heightmap[b]
+        rest = torch.where(window, heights, 0).flatten(1).amax(1)
+        gap = torch.where(window, rest[:, None, None] - heights, 0)
+        top = (rest + box[:, 2]).to(heights.dtype)
+        after = torch.where(window, top[:, None, None], heights)
+        legal = hull_torch.support_mask(
+            after, (bins.empty_map[b] + gap).to(torch.int16),
+            boxes.expand(len(some), -1, -1).contiguous(), height, None, 0.0,
+        ).sum((2, 3))  # fmt: skip
+        room[b, a, x, y] = legal.float().mean(1)
+        fits[b, a, x, y] = (legal > 0)[:, turned].any(2).float().mean(1)
+    return room, fits

@@ -1,0 +1,119 @@
+"""What placements leave: against the meaning of the words, and tensor code against compiled."""
+
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+import torch
+
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.bins import ORIENTATIONS
+from marl_pack.packing import Packing
+from marl_pack.stability import reference
+from marl_pack.stability.room import _room_torch, probe_lengths, room_left
+
+GAMES = (
+    {},
+    {"size": (6, 5, 7), "sides": (1, 3)},
+    {"orientations": (0, 3)},
+    {"size": (16, 12, 20), "sides": (3, 12)},
+)
+
+
+def in_play(n: int, steps: int, **settings: object) -> Packing:
+    game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]
+    policy = make_policy("random", seed=1)
+    for _ in range(steps):
+        game.place(*policy(game))
+    return game
+
+
+def legal_cells(heights: np.ndarray, hollow: np.ndarray, box: tuple[int, ...], top: int) -> int:
+    """Cells where ``box`` stands by hull_alpha, one window at a time."""
+    w, d, _ = box
+
+    def stands(x: int, y: int) -> bool:
+        window = np.s_[x : x + w, y : y + d]
+        return reference.hull(heights[window], hollow[window] == 0, (w / 2, d / 2))
+
+    return int(reference.window_mask(stands, heights, box, top).sum())
+
+
+@pytest.mark.parametrize("orientations", [(0, 1, 2, 3, 4, 5), (0, 1), (3,)])
+def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) -> None:
+    game = in_play(3, 4, size=(5, 4, 6), sides=(1, 3), orientations=orientations)
+    room, fits = game.room()
+    chances = []
+    for b, o in product(range(3), orientations):
+        for x, y in game.mask[b, o].nonzero().tolist()[:2]:
+            after = game.branch(torch.tensor([b]))
+            after.place(torch.tensor([o]), torch.tensor([x * 4 + y]))
+            maps = after.bins.heightmap[0].numpy(), after.bins.empty_map[0].numpy()
+            boxes = list(product((1, 2, 3), repeat=3))
+            cells = {box: legal_cells(*maps, box, 6) for box in boxes}
+            assert room[b, o, x, y].item() == pytest.approx(np.mean(list(cells.values())))
+            ways = [ORIENTATIONS[a] for a in orientations]
+            found = [any(cells[tuple(box[k] for k in way)] for way in ways) for box in boxes]
+            assert fits[b, o, x, y].item() == pytest.approx(np.mean(found))
+            chances.append(np.mean(found))
+    assert min(chances) < 1  # some placements leave no place for some items
+    assert not room[~game.mask].any()
+    assert not fits[~game.mask].any()
+
+
+@pytest.mark.parametrize("settings", GAMES)
+def test_tensor_code_gives_the_same_numbers(settings: dict[str, object]) -> None:
+    game = in_play(6, 9, **settings)
+    sides = game.candidates(game.items, game.weights).sides
+    lengths = probe_lengths(*game.stream.sides)
+    compiled = room_left(game.bins, sides, game.mask, lengths, game.orientations)
+    tensors = _room_torch(game.bins, sides, game.mask, lengths, game.orientations)
+    for ours, theirs in zip(compiled, tensors, strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_no_placement_no_room() -> None:
+    game = Packing(2, (4, 4, 4), [[3, 3, 3]] * 3, auto_reset=False)
+    while game.alive.any():
+        game.place(*make_policy("dblf")(game))
+    room, fits = game.room()
+    assert room.shape == fits.shape == (2, 6, 4, 4)
+    assert not room.any()
+
+
+def test_it_is_of_the_moment_and_a_branch_has_its_own() -> None:
+    game = in_play(4, 3)
+    first = game.room()[0]
+    assert game.room()[0] is first
+    copy = game.branch(torch.tensor([2, 0]))
+    assert torch.equal(copy.room()[0], first[[2, 0]])
+    game.place(*make_policy("dblf")(game))
+    assert not torch.equal(game.room()[0], first)
+    assert torch.equal(copy.room()[0], first[[2, 0]])
+    kept = game.state_dict()
+    second = game.room()[0]
+    game.place(*make_policy("dblf")(game))
+    game.load_state_dict(kept)
+    assert torch.equal(game.room()[0], second)
+
+
+def test_lengths_are_spread_evenly_and_few() -> None:
+    assert probe_lengths(2, 5) == (2, 3, 4, 5)
+    assert probe_lengths(1, 5) == (1, 2, 3, 4, 5)
+    assert probe_lengths(6, 60) == (6, 20, 33, 46, 60)
+    assert probe_lengths(3, 3) == (3,)
+
+
+def test_the_heuristic_leaves_more_than_others_do() -> None:
+    assert sorted(ORIENTATIONS) == list(permutations(range(3)))
+    game = in_play(32, 6)
+    rows = torch.arange(32)
+    left = []
+    for name in ("most_room", "dblf", "random"):
+        o, c = make_policy(name)(game)
+        left.append(game.room()[0].flatten(2)[rows, o, c])
+    assert (left[0] >= left[1]).all()
+    assert (left[0] >= left[2]).all()
+    assert left[0].mean() > left[1].mean() > left[2].mean()
+    best = game.room()[0].flatten(1).amax(1)
+    assert torch.equal(left[0], best)
