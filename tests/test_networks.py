@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor
 from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes
 from marl_pack.packing import Packing
@@ -43,7 +44,7 @@ def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
     assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
     game = Packing(2, (6, 6, 6), sides=(2, 4))
     seen = orientation.observe(game, PLANES)
-    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 5 * 6 + 1, 6, 6)
+    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 5 * 6 + 2, 6, 6)
 
 
 def test_solid_are_the_columns_without_a_gap() -> None:
@@ -71,6 +72,33 @@ def test_three_layers_look_as_far_as_their_dilation_lets_them(dilation: int, far
     changed = (trunk(seen) != flat).any(1)[0].nonzero()
     assert changed.min(0).values.tolist() == [7 - far, 7 - far]
     assert changed.max(0).values.tolist() == [7 + far, 7 + far]
+
+
+def test_with_a_shortcut_the_heads_see_the_planes() -> None:
+    game = Packing(3, seed=1)
+    seen = orientation.observe(game, ("mask", "room"))
+    network = Network(channels=4, layers=2, planes=["mask", "room"], shortcut=True)
+    features = Trunk(6, network)(seen)
+    planes = input_planes(seen, network.planes)
+    assert features.shape == (3, 4 + 4 + 6 + 7, 10, 10)
+    assert torch.equal(features[:, 4:], planes)
+
+
+def test_room_is_seen_beside_the_most_there_is() -> None:
+    game = Packing(4, seed=1)
+    for _ in range(8):
+        game.place(*make_policy("dblf")(game))
+    seen = orientation.observe(game, ("room",))
+    planes = input_planes(seen, ["room"])
+    room, most = planes[:, 4:10], planes[:, 10]
+    assert (room.flatten(1).amax(1) == 1).all()
+    assert (room[~game.mask] == 0).all()
+    best = game.room()[0].flatten(1).argmax(1)
+    assert (room.flatten(1).gather(1, best[:, None]) == 1).all()
+    assert torch.allclose(most[:, 0, 0], game.room()[0].flatten(1).amax(1).log1p() / 4)
+    chosen = best // 100
+    turned = input_planes(placement.observe(game, ("room",), chosen), ["room"])
+    assert torch.equal(turned[:, 4], room[torch.arange(4), chosen])
 
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:

@@ -86,7 +86,7 @@ class Critic(MLPModel):
         else:
             # Not registered as a part: its weights belong to the actor's state and parameters.
             self._features = cnns.take
-        self.mlp = pooled_head(shape, output_dim, 1.0)
+        self.mlp = pooled_head(shape, AGENTS[agent].WAYS, output_dim, 1.0)
 
     def get_latent(
         self, obs: Mapping[str, Tensor], masks: Tensor | None = None, hidden_state: None = None

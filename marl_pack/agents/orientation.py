@@ -28,8 +28,8 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
         ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
-        ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 6, W, D], ``solid`` bool
-        [N, W, D].
+        ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 6, W, D], ``best_room``
+        float32 [N, 1], ``solid`` bool [N, W, D].
     """
     seen = {
         "heightmap": game.bins.heightmap.clone(),
@@ -61,12 +61,14 @@ def ahead(
     if not wanted:
         return {}
     made = dict(zip(("room", "fits"), game.room(), strict=True))
+    best = made["room"].flatten(1).amax(1, keepdim=True)
     if orientation is not None:
         rows = torch.arange(game.n, device=game.device)
         made = {name: values[rows, orientation][:, None] for name, values in made.items()}
-    return {name: made[name] for name in wanted}
+    found = {name: made[name] for name in wanted}
+    return found | {"best_room": best} if "room" in wanted else found
 
 
 def make_head(network: Network) -> nn.Module:
     """Features [B, C, W, D] → logits of the orientations [B, 6]."""
-    return pooled_head(network, WAYS, 0.01)
+    return pooled_head(network, WAYS, WAYS, 0.01)

@@ -31,6 +31,7 @@ class Network:
         residual: whether each convolution after the first adds to its input.
         dilation: cells between the taps of each convolution after the first; with 2, three layers
             look 5 cells far in place of 3.
+        shortcut: whether the heads see the planes themselves beside the features.
         context: whether features pooled over the whole bin are added to every cell's.
         planes: what is seen beside the paper's four channels: any of mask, rest, waste, room,
             fits, solid.
@@ -42,6 +43,7 @@ class Network:
     layers: int = 3
     residual: bool = True
     dilation: int = 1
+    shortcut: bool = False
     context: bool = False
     planes: list[str] = field(default_factory=lambda: ["mask", "rest", "waste"])
     hidden: int = 64
@@ -62,12 +64,13 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
     Args:
         observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
             and for the extra planes ``cells`` bool, ``rest`` int, ``waste`` int, ``room`` float or
-            ``fits`` float [B, A, W, D], ``solid`` bool [B, W, D].
+            ``fits`` float [B, A, W, D], ``best_room`` float [B, 1], ``solid`` bool [B, W, D].
         planes: which of :data:`PLANES`.
 
     Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
-    share of the item's own volume, so that the planes mean the same in every bin. Of the room the
-    logarithm is seen, since cells count most where few are left.
+    share of the item's own volume, so that the planes mean the same in every bin. Room is seen
+    beside the most that any placement of the item would leave: 1 for that, 0 from a fifth less on.
+    How much the most is comes as one more channel.
     """
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]
@@ -81,7 +84,10 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
         elif plane == "rest":
             seen.append(observation["rest"].float() / height[:, :, None, None])
         elif plane == "room":
-            seen.append(observation["room"].log1p())
+            room, most = observation["room"], observation["best_room"][:, :, None, None]
+            close = 1 + 5 * (room.log1p() - most.log1p())
+            seen.append(close.clamp(min=0) * (room > 0))
+            seen.append(most.log1p().expand(-1, 1, width, depth) / 4)
         elif plane == "fits":
             seen.append(observation["fits"])
         elif plane == "solid":
@@ -93,7 +99,13 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
 
 def count_planes(planes: list[str], ways: int) -> int:
     """Channels that :func:`input_planes` makes for A = ``ways`` orientations."""
-    return 4 + sum(1 if plane == "solid" else ways for plane in planes)
+    channels = {"solid": 1, "room": ways + 1}
+    return 4 + sum(channels.get(plane, ways) for plane in planes)
+
+
+def count_features(network: Network, ways: int) -> int:
+    """Channels that a trunk makes for A = ``ways`` orientations."""
+    return network.channels + (count_planes(network.planes, ways) if network.shortcut else 0)
 
 
 def pool(features: Tensor) -> Tensor:
@@ -104,7 +116,7 @@ def pool(features: Tensor) -> Tensor:
 
 
 class Trunk(nn.Module):
-    """Observation → features [B, C, W, D].
+    """Observation → features [B, C, W, D], C as :func:`count_features` says.
 
     Args:
         ways: orientations A for which the extra planes come.
@@ -114,6 +126,7 @@ class Trunk(nn.Module):
     def __init__(self, ways: int, network: Network) -> None:
         super().__init__()
         self.planes, self.residual = list(network.planes), network.residual
+        self.shortcut = network.shortcut
         channels = network.channels
         wide = [count_planes(self.planes, ways)] + [channels] * network.layers
         apart = [1] + [network.dilation] * (network.layers - 1)
@@ -127,13 +140,13 @@ class Trunk(nn.Module):
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
         """Features of every cell."""
-        x = input_planes(observation, self.planes)
+        x = planes = input_planes(observation, self.planes)
         for k, convolution in enumerate(self.convolutions):
             y = torch.relu(convolution(x))
             x = x + y if self.residual and k else y
             if k == 0 and self.context is not None:
                 x = x + self.context(pool(x))[:, :, None, None]
-        return x
+        return torch.cat((x, planes), 1) if self.shortcut else x
 
     def keep(self, observation: Mapping[str, Tensor]) -> Tensor:
         """The features, kept for one :meth:`take` with the same observation."""
@@ -158,11 +171,11 @@ def initialized(layer: nn.Conv2d | nn.Linear, gain: float = math.sqrt(2)) -> nn.
     return layer
 
 
-def pooled_head(network: Network, outputs: int, gain: float) -> nn.Sequential:
-    """Pooled features → ``outputs`` numbers, by one hidden layer."""
+def pooled_head(network: Network, ways: int, outputs: int, gain: float) -> nn.Sequential:
+    """Pooled features of a trunk → ``outputs`` numbers, by one hidden layer."""
     return nn.Sequential(
         Pool(),
-        initialized(nn.Linear(2 * network.channels, network.hidden)),
+        initialized(nn.Linear(2 * count_features(network, ways), network.hidden)),
         nn.ReLU(),
         initialized(nn.Linear(network.hidden, outputs), gain),
     )
@@ -186,7 +199,7 @@ class ScoreMap(nn.Module):
 
     def __init__(self, ways: int, network: Network) -> None:
         super().__init__()
-        self.scores = initialized(nn.Conv2d(network.channels, ways, 1), 0.01)
+        self.scores = initialized(nn.Conv2d(count_features(network, ways), ways, 1), 0.01)
 
     def forward(self, features: Tensor) -> Tensor:
         """Scores in the order of the actions: orientation, x, y."""
