@@ -1,13 +1,16 @@
-"""What each agent brings: ``python -m benchmarks.ablations`` trains and compares.
+"""What each agent, and each choice, brings: ``python -m benchmarks.ablations`` trains and compares.
 
-Every config in ``configs/ablations`` is trained with three seeds for the same number of items; runs
-that are there already are gone on with or just read. The figure of a run is its last evaluation, on
-the same held-out sequences for all; the interval is Student's over the seeds.
+Every config in ``configs/ablations`` is trained with three seeds for the same number of items. With
+``--config`` and ``--changes`` it is one config, each time with the options of one change. Runs that
+are there already are gone on with or just read. The figure of a run is its last evaluation, on the
+same held-out sequences for all; the interval is Student's over the seeds.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -22,14 +25,14 @@ CONFIGS = Path(__file__).parent.parent / "configs" / "ablations"
 SEEDS = (0, 1, 2)
 
 
-def train(config: Path, seed: int, folder: Path) -> Path:
+def train(name: str, options: list[str], seed: int, folder: Path) -> Path:
     """Train one run to its end, unless it is there; returns its folder."""
-    run = folder / f"{config.stem}_{seed}"
+    run = folder / f"{name}_{seed}"
     command = [sys.executable, "-m", "marl_pack.train"]
     if (run / "latest.pt").is_file():
         command += ["--resume", str(run)]
     else:
-        command += ["--config", str(config), "--seed", str(seed), "--output.name", run.name,
+        command += [*options, "--seed", str(seed), "--output.name", run.name,
                     "--output.folder", str(folder)]  # fmt: skip
     subprocess.run(command, check=True)
     return run
@@ -40,15 +43,29 @@ def main() -> None:
     options = argparse.ArgumentParser(prog="python -m benchmarks.ablations")
     options.add_argument("names", nargs="*", help="configs in configs/ablations (default: all)")
     options.add_argument("--folder", type=Path, default=Path("runs/ablations"))
+    options.add_argument("--config", type=Path, help="train this config, changed, in their place")
+    options.add_argument("--changes", nargs="+", default=[], metavar="OPTIONS",
+                         help='of marl_pack.train, a string each; "" for no change')  # fmt: skip
+    options.add_argument("--every", default="", metavar="OPTIONS", help="options of every run")
     chosen = options.parse_args()
-    configs = [CONFIGS / f"{n}.yaml" for n in chosen.names] or sorted(CONFIGS.glob("*.yaml"))
+    if bool(chosen.config) != bool(chosen.changes):
+        options.error("--config and --changes go together")
+    if chosen.config:
+        runs = {
+            "_".join((chosen.config.stem, *re.findall(r"[\w.]+", change))): (chosen.config, change)
+            for change in chosen.changes
+        }
+    else:
+        named = [CONFIGS / f"{n}.yaml" for n in chosen.names] or sorted(CONFIGS.glob("*.yaml"))
+        runs = {config.stem: (config, "") for config in named}
     table = []
-    for config in configs:
-        last = [history(train(config, seed, chosen.folder))[-1] for seed in SEEDS]
+    for name, (config, change) in runs.items():
+        given = ["--config", str(config), *shlex.split(chosen.every), *shlex.split(change)]
+        last = [history(train(name, given, seed, chosen.folder))[-1] for seed in SEEDS]
         u = 100 * np.array([row["utilization"] for row in last])
         bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
         minutes = np.mean([row["seconds"] for row in last]) / 60
-        table.append([config.stem, f"{u.mean():.2f} ± {(bounds.high - bounds.low) / 2:.2f}",
+        table.append([name, f"{u.mean():.2f} ± {(bounds.high - bounds.low) / 2:.2f}",
                       " ".join(f"{value:.2f}" for value in u), f"{last[0]['items']:,.0f}",
                       f"{minutes:.1f}"])  # fmt: skip
     columns = ["config", "utilization %", "each seed", "items", "minutes"]

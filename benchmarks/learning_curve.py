@@ -1,7 +1,7 @@
 """Utilization against items seen and against time: ``python -m benchmarks.learning_curve RUN …``.
 
-Reads the runs' ``evaluations.csv`` and writes a picture; prints when each run passed the levels
-that others reach.
+Reads the runs' ``evaluations.csv`` (a run's folder, or such a file, as models/ has them) and writes
+a picture; prints when each run passed the levels that others reach.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ LEVELS = (
 
 def history(run: Path) -> Any:
     """The rows of a run's evaluations, as a structured array."""
-    return np.atleast_1d(
-        np.genfromtxt(run / "evaluations.csv", delimiter=",", names=True, dtype=float)
-    )
+    path = run if run.is_file() else run / "evaluations.csv"
+    return np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=float))
 
 
 def draw(runs: list[Path], path: Path) -> None:
@@ -39,7 +38,7 @@ def draw(runs: list[Path], path: Path) -> None:
     for run in runs:
         rows = history(run)
         for panel, x in zip(panels, (rows["items"] / 1e6, rows["seconds"] / 60), strict=True):
-            panel.plot(x, 100 * rows["utilization"], label=run.name)
+            panel.plot(x, 100 * rows["utilization"], label=run.stem)
             panel.fill_between(x, 100 * rows["low"], 100 * rows["high"], alpha=0.2)
     for panel, label in zip(panels, ("million items seen", "minutes on one core"), strict=True):
         for name, level in LEVELS:
@@ -56,7 +55,7 @@ def draw(runs: list[Path], path: Path) -> None:
 def main() -> None:
     """The picture and the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.learning_curve")
-    options.add_argument("runs", nargs="+", type=Path, help="runs' folders")
+    options.add_argument("runs", nargs="+", type=Path, help="runs' folders, or evaluations' files")
     options.add_argument("--picture", type=Path, default=Path("docs/learning_curve.png"))
     chosen = options.parse_args()
     draw(chosen.runs, chosen.picture)
@@ -68,11 +67,11 @@ def main() -> None:
             when = ["not reached", ""]
             if len(passed):
                 when = [f"{passed[0]['items']:,.0f}", f"{passed[0]['seconds'] / 60:.1f}"]
-            table.append([run.name, f"{name}, {level} %", *when])
+            table.append([run.stem, f"{name}, {level} %", *when])
         last = rows[-1]
         half = 50 * (last["high"] - last["low"])
         table.append(
-            [run.name, f"end: {100 * last['utilization']:.2f} ± {half:.2f} %",
+            [run.stem, f"end: {100 * last['utilization']:.2f} ± {half:.2f} %",
              f"{last['items']:,.0f}", f"{last['seconds'] / 60:.1f}"]
         )  # fmt: skip
     show("first evaluation clearly above", ["run", "level", "items", "minutes"], table)

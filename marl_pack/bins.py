@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from numbers import Real
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
+from torch.nn.functional import pad
 
 ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
     (0, 1, 2),
@@ -74,6 +75,12 @@ class Bins:
     def clone(self) -> Bins:
         """An independent copy."""
         return self._each(Tensor.clone)
+
+    def for_boxes(self, most: int) -> Bins:
+        """Bins that hold ``most`` boxes at least; everything else is shared."""
+        more = max(0, most - self.boxes.shape[1])
+        boxes, loads = (pad(rows, (0, 0, 0, more)) for rows in (self.boxes, self.loads))
+        return replace(self, boxes=boxes, loads=loads)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Bins:
         heightmap, empty_map, boxes, loads, count, filled = map(change, self.tensors())

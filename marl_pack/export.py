@@ -79,6 +79,8 @@ def example(agent: str, planes: Sequence[str], batch: int, size: tuple[int, int,
         seen["best_room"] = torch.ones(batch, 1)
     if "solid" in planes:
         seen["solid"] = torch.ones(batch, width, depth, dtype=torch.bool)
+    if "filled" in planes:
+        seen["filled"] = torch.rand(batch, 1, generator=generator)
     return seen
 
 
@@ -87,9 +89,9 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 
     Inputs are the groups of the agent's ``observe``, whole numbers as int64: ``heightmap``
     [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and ``cells`` bool,
-    ``rest``, ``waste``, float32 ``room``, ``fits`` [B, A, W, D], ``best_room`` [B, 1], ``solid``
-    bool [B, W, D] where its network has these planes. Outputs are ``action`` int64 [B] and
-    ``probabilities`` float32 [B, K].
+    ``rest``, ``waste``, float32 ``room``, ``fits`` [B, A, W, D], ``best_room``, ``filled``
+    [B, 1], ``solid`` bool [B, W, D] where its network has these planes. Outputs are ``action``
+    int64 [B] and ``probabilities`` float32 [B, K].
 
     Returns:
         The names of the inputs.
@@ -106,6 +108,7 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
         "item": {0: batch},
         "height": {0: batch},
         "best_room": {0: batch},
+        "filled": {0: batch},
         "mask": {0: batch} if agent == "orientation" else {0: batch, 1: actions},
     }
     for plane in ("cells", "rest", "waste", "room", "fits"):

@@ -286,6 +286,8 @@ class Packing:
         else:
             assert episodes is not None
             game.stream, game.seed, game.episode = stream, seed, episodes
+            smallest = min(self.stream.smallest, stream.smallest)
+            game.bins = game.bins.for_boxes(self.volume // smallest)
             game.stream_state = stream.start(seed, episodes)
         return game
 

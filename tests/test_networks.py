@@ -44,7 +44,7 @@ def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
     assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
     game = Packing(2, (6, 6, 6), sides=(2, 4))
     seen = orientation.observe(game, PLANES)
-    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 5 * 6 + 2, 6, 6)
+    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 5 * 6 + 3, 6, 6)
 
 
 def test_solid_are_the_columns_without_a_gap() -> None:

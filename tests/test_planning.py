@@ -111,11 +111,26 @@ def test_pairs_share_their_futures_and_no_future_is_what_comes(
     monkeypatch.setattr(Packing, "branch", spied)
     real = game(1, 2, seed=0)
     Planner(*agents, None, Plan(rollouts=4, top=3), FUTURES, seed=0)(real)
-    imagined = next(one for one in seen if one.n == 12)
-    keys = imagined.stream_state.view(3, 4)
-    assert (keys == keys[0]).all()
-    assert len(set(keys[0].tolist())) == 4
-    assert int(real.stream_state) not in keys
+    first, second = (one.stream_state for one in seen if one.n == 6 and one.seed < 0)
+    drawn = []
+    for keys in (first.view(3, 2), second.view(2, 3)):  # 3 pairs, then the better 2
+        assert (keys == keys[0]).all()
+        drawn += keys[0].tolist()
+    assert len(set(drawn)) == 5
+    assert int(real.stream_state) not in drawn
+
+
+def test_orientations_that_turn_a_box_into_itself_count_as_one(
+    agents: tuple[Actor, Actor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = Planner(*agents, None, Plan(rollouts=1, top=200), FUTURES)
+    cube = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False)
+    pairs = planner._propose(cube)
+    assert len(set(pairs[0].tolist())) == 4  # its places; the rest repeat the best
+    turned = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, orientations=[2, 5])
+    assert {pair // 16 for pair in planner._propose(turned)[0].tolist()} == {2}
+    heavy = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, com_offset=(0.1, 0, 0))
+    assert len(set(planner._propose(heavy)[0].tolist())) == int(heavy.mask.sum())
 
 
 def test_a_bin_with_few_pairs_or_at_its_end_is_planned_too(agents: tuple[Actor, Actor]) -> None:

@@ -35,6 +35,7 @@ def in_mirrored_bin(game: Packing, symmetry: int) -> Packing:
     other = Packing(game.n, size, sides=(1, 4), seed=5)
     other.bins.heightmap.copy_(mirrored_map(game.bins.heightmap, symmetry))
     other.bins.empty_map.copy_(mirrored_map(game.bins.empty_map, symmetry))
+    other.bins.filled.copy_(game.bins.filled)
     other.items, other.weights = game.items, game.weights
     other._look()
     return other

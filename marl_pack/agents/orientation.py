@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from marl_pack.agents.trunk import Network, pooled_head
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.bins import ORIENTATIONS, utilization
 from marl_pack.packing import Packing
 from marl_pack.stability.windows import rest_and_waste
 
@@ -29,7 +29,7 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
         ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
         ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 6, W, D], ``best_room``
-        float32 [N, 1], ``solid`` bool [N, W, D].
+        float32 [N, 1], ``solid`` bool [N, W, D], ``filled`` float32 [N, 1].
     """
     seen = {
         "heightmap": game.bins.heightmap.clone(),
@@ -44,12 +44,14 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
 
 
 def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tensor]:
-    """What those planes need that look under boxes of ``sides`` [N, A, 3]."""
+    """What those planes need that show the bin, or look under boxes of ``sides`` [N, A, 3]."""
     made: dict[str, Tensor] = {}
     if "rest" in planes or "waste" in planes:
         made["rest"], made["waste"] = rest_and_waste(game.bins, sides, waste="waste" in planes)
     if "solid" in planes:
         made["solid"] = game.bins.empty_map == 0
+    if "filled" in planes:
+        made["filled"] = utilization(game.bins)[:, None].float()
     return {name: made[name] for name in planes if name in made}
 
 

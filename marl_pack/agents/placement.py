@@ -35,7 +35,7 @@ def observe(
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its sides along x, y, z),
         ``height`` int16 [N, 1], ``mask`` bool [N, W · D], and what the planes need: ``cells``
         bool, ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 1, W, D],
-        ``best_room`` float32 [N, 1], ``solid`` bool [N, W, D].
+        ``best_room`` float32 [N, 1], ``solid`` bool [N, W, D], ``filled`` float32 [N, 1].
     """
     oriented = game.orient(orientation)
     seen = {

@@ -1,14 +1,16 @@
 """Planning at decision time: the agents' best pairs, each played on in imagined futures.
 
 The learned agents propose: of all legal pairs (orientation, cell) the M whose joint probability
-π_o(o) · π_p(cell | o) is highest. Each is then played in K futures, drawn from the known
-distribution of the items and the same for all pairs, by the same agents without planning. The pair
-whose bin is fullest in the mean is taken. An imagined game is an ordinary one, with the same masks:
-planning cannot choose what the agents may not.
+π_o(o) · π_p(cell | o) is highest; orientations that turn a box into itself count as one. Each is
+then played in futures drawn from the known distribution of the items and the same for all pairs, by
+the same agents without planning: in few futures for all M pairs, then in more for the better half,
+and so on. The pair whose bin is fullest in the mean is taken. An imagined game is an ordinary one,
+with the same masks: planning cannot choose what the agents may not.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +22,7 @@ from marl_pack.agents import orientation, placement
 from marl_pack.agents.checkpoint import load_actor, load_critic
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import Choice
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.bins import ORIENTATIONS, oriented
 from marl_pack.items import Stream
 from marl_pack.packing import Packing
 
@@ -33,7 +35,7 @@ class Plan:
     """How far to look.
 
     Args:
-        rollouts: imagined futures K for each pair.
+        rollouts: imagined futures K for each pair, in the mean.
         top: pairs M to be tried.
         depth: items to be placed in each future before the orientation agent's critic values what
             may still come; None plays every future to its end.
@@ -107,30 +109,42 @@ class Planner:
         return chosen[0], chosen[1]
 
     def _decide(self, game: Packing, which: Tensor) -> Tensor:
-        """The pairs for the bins ``which`` [B], int64 [2, B]."""
-        k = self.plan.rollouts
-        pairs = self._propose(game.branch(which))  # [B, M]
-        top = pairs.shape[1]
-        value = self._imagine(
-            game.branch(
-                which.repeat_interleave(top * k),
-                self.futures,
-                self.seed,
-                self._futures(game, which, top),
-            ),
-            pairs.repeat_interleave(k, 1).flatten(),
-        )
-        mean = value.view(len(which), top, k).mean(2)
-        best = pairs.gather(1, mean.argmax(1, keepdim=True)).squeeze(1)
-        cells = game.size[0] * game.size[1]
-        return torch.stack((best // cells, best % cells))
+        """The pairs for the bins ``which`` [B], int64 [2, B].
 
-    def _futures(self, game: Packing, which: Tensor, top: int) -> Tensor:
-        """Numbers of the futures [B · M · K]: K for each bin, episode and item; one set a pair."""
-        k = self.plan.rollouts
+        By sequential halving (Karnin et al. 2013): each round plays as many futures in all, and the
+        better half of the pairs goes on to the next.
+        """
+        pairs = self._propose(game.branch(which))  # [B, M]
+        total, played = torch.zeros(pairs.shape, dtype=torch.float64, device=game.device), 0
+        rounds = max(1, math.ceil(math.log2(pairs.shape[1])))
+        for _ in range(rounds):
+            top = pairs.shape[1]
+            k = max(1, self.plan.top * self.plan.rollouts // (rounds * top))
+            value = self._imagine(
+                game.branch(
+                    which.repeat_interleave(top * k),
+                    self.futures,
+                    self.seed,
+                    self._futures(game, which, top, played, k),
+                ),
+                pairs.repeat_interleave(k, 1).flatten(),
+            )
+            total, played = total + value.view(len(which), top, k).sum(2), played + k
+            better = total.topk(-(-top // 2), 1).indices
+            pairs, total = pairs.gather(1, better), total.gather(1, better)
+        cells = game.size[0] * game.size[1]
+        return torch.stack((pairs[:, 0] // cells, pairs[:, 0] % cells))
+
+    def _futures(self, game: Packing, which: Tensor, top: int, first: int, k: int) -> Tensor:
+        """Numbers [B · M · k] of ``k`` futures from ``first`` on: for each bin, episode and item.
+
+        One set for all pairs.
+        """
         decision = game.episode[which] * game.bins.boxes.shape[1] + game.t[which]
-        numbers = decision[:, None, None] * k + torch.arange(k, device=which.device)
-        return numbers.expand(-1, top, -1).flatten()
+        most = self.plan.top * self.plan.rollouts
+        numbers = decision * most + first
+        each = numbers[:, None, None] + torch.arange(k, device=which.device)
+        return each.expand(-1, top, -1).flatten()
 
     def _propose(self, game: Packing) -> Tensor:
         """The M most probable pairs ``o · W · D + cell``, int64 [B, M].
@@ -149,10 +163,14 @@ class Planner:
             self.placement_agent,
             placement.observe(game.branch(every), self.placement_agent.cnns.planes, turned),
         )  # [B · 6, W · D]
-        both = first[:, :, None] + second.view(game.n, ways, cells)
-        both = both.masked_fill(~game.mask.flatten(2), -torch.inf).flatten(1)
+        both = (first[:, :, None] + second.view(game.n, ways, cells)).double().exp()
+        legal = game.mask.flatten(2)
+        same = _twins(game)
+        both = torch.einsum("noe,nec->noc", same.to(both), both * legal)
+        before = torch.einsum("noe,nec->noc", same.tril(-1).to(both), legal.to(both))
+        both = both.masked_fill(~legal | (before > 0), 0).flatten(1)
         found, pairs = both.topk(min(self.plan.top, both.shape[1]))
-        return torch.where(found > -torch.inf, pairs, pairs[:, :1])
+        return torch.where(found > 0, pairs, pairs[:, :1])
 
     @staticmethod
     def _log_probs(actor: Actor, seen: Mapping[str, Tensor]) -> Tensor:
@@ -184,6 +202,16 @@ class Planner:
             turned = self.orientation_agent(seen).squeeze(1).long()
             seen = placement.observe(game, self.placement_agent.cnns.planes, turned)
             choice = turned, self.placement_agent(seen).squeeze(1).long()
+
+
+def _twins(game: Packing) -> Tensor:
+    """Bool [N, 6, 6]: which orientations of the item are the same box, set down the same way."""
+    sides = oriented(game.items)
+    if any(game.com_offset):  # then a turned cube is another cube
+        return torch.eye(len(ORIENTATIONS), dtype=torch.bool, device=sides.device).expand(
+            game.n, -1, -1
+        )
+    return (sides[:, :, None] == sides[:, None]).all(3)
 
 
 def make_planner(

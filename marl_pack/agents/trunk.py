@@ -13,12 +13,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-PLANES = ("mask", "rest", "waste", "room", "fits", "solid")
+PLANES = ("mask", "rest", "waste", "room", "fits", "solid", "filled")
 """Extra planes a network may see. For each orientation its agent has to judge: the cells where the
 item may be set down, its resting height at every cell, the space it would enclose there, and what
 each placement would leave: in how many cells the next item may be set down in the mean, and how
 probable it is that it finds a place (:mod:`marl_pack.stability.room`). Once: the columns that are
-filled to the floor, which is what ``hull_alpha`` rests on."""
+filled to the floor, which is what ``hull_alpha`` rests on; and how much of the bin is filled, which
+where the items were cut from it says how much is still to come."""
 
 
 @dataclass
@@ -34,7 +35,7 @@ class Network:
         shortcut: whether the heads see the planes themselves beside the features.
         context: whether features pooled over the whole bin are added to every cell's.
         planes: what is seen beside the paper's four channels: any of mask, rest, waste, room,
-            fits, solid.
+            fits, solid, filled.
         hidden: units of the hidden layer in the heads that follow pooling.
         share_trunk: whether the critic looks at the actor's features or has a trunk of its own.
     """
@@ -64,7 +65,8 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
     Args:
         observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
             and for the extra planes ``cells`` bool, ``rest`` int, ``waste`` int, ``room`` float or
-            ``fits`` float [B, A, W, D], ``best_room`` float [B, 1], ``solid`` bool [B, W, D].
+            ``fits`` float [B, A, W, D], ``best_room`` float [B, 1], ``solid`` bool [B, W, D],
+            ``filled`` float [B, 1].
         planes: which of :data:`PLANES`.
 
     Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
@@ -92,6 +94,8 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
             seen.append(observation["fits"])
         elif plane == "solid":
             seen.append(observation["solid"].float()[:, None])
+        elif plane == "filled":
+            seen.append(observation["filled"][:, :, None, None].expand(-1, -1, width, depth))
         else:
             seen.append(observation["waste"].float() / (item.prod(1) + 1)[:, None, None, None])
     return torch.cat(seen, 1).contiguous(memory_format=torch.channels_last)
@@ -99,7 +103,7 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
 
 def count_planes(planes: list[str], ways: int) -> int:
     """Channels that :func:`input_planes` makes for A = ``ways`` orientations."""
-    channels = {"solid": 1, "room": ways + 1}
+    channels = {"solid": 1, "filled": 1, "room": ways + 1}
     return 4 + sum(channels.get(plane, ways) for plane in planes)
 
 
