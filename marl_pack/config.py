@@ -180,7 +180,7 @@ class Config:
         seed: seed of weights, actions and items.
         device: where everything happens: cpu, cuda, or cuda:1; with torchrun, cuda means each
             process's own GPU.
-        threads: threads of torch on the CPU.
+        threads: threads on the CPU.
         joint: one agent that chooses the pair (orientation, cell) in place of the two; its network
             is placement.network.
         init: a run's folder or checkpoint whose weights the learning agents begin with; null for

@@ -308,7 +308,7 @@ def parser() -> argparse.ArgumentParser:
         help="of generated items, random play and drawn bodies (default: 0)",
     )
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
-    add("--threads", type=int, default=1, help="of torch on the CPU (default: 1)")
+    add("--threads", type=int, default=1, help="on the CPU (default: 1)")
     add("--physics", action="store_true",
         help="judge every packing in SAPIEN after each placement: the column falls")  # fmt: skip
     Bodies.add_options(options)

@@ -10,7 +10,7 @@ from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.packing import Packing
 from marl_pack.stability import reference
-from marl_pack.stability.room import _room_torch, probe_lengths, room_left
+from marl_pack.stability.room import WORTH_A_THREAD, _room_torch, probe_lengths, room_left
 
 GAMES = (
     {},
@@ -117,3 +117,16 @@ def test_the_heuristic_leaves_more_than_others_do() -> None:
     assert left[0].mean() > left[1].mean() > left[2].mean()
     best = game.room()[0].flatten(1).amax(1)
     assert torch.equal(left[0], best)
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    game = in_play(12, 5)
+    sides = game.candidates(game.items, game.weights).sides
+    lengths = probe_lengths(*game.stream.sides)
+    assert int(game.mask.sum()) > 3 * WORTH_A_THREAD  # so several share the work
+    given = []
+    for threads in (1, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda t=threads: t)
+        given.append(room_left(game.bins, sides, game.mask, lengths))
+    for alone, shared in zip(*given, strict=True):
+        assert torch.equal(alone, shared)

@@ -5,12 +5,15 @@ asked where the boxes that may come next could then stand. Two numbers come of i
 such a box may be set down in the mean, and how probable it is that the next item finds a place at
 all. What may come is every box whose sides are of given lengths, each as probable as the other.
 
-On the CPU compiled loops, elsewhere tensor code; both give the same numbers.
+On the CPU compiled loops in as many threads as torch has, elsewhere tensor code; both give the same
+numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -25,6 +28,7 @@ from marl_pack.stability import hull_cpu, hull_torch
 MOST_LENGTHS = 5
 """Of so many lengths of a side boxes are made at most."""
 AT_ONCE = 1 << 20  # cells of masks made at once
+WORTH_A_THREAD = 256  # placements
 
 
 def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
@@ -161,6 +165,11 @@ def _write(sides: Any, placements: Any, cells: Any, chance: Any, room: Any, fits
                 room[b, e, x, y], fits[b, e, x, y] = cells[k], chance[k]
 
 
+@cache
+def _workers(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "room")
+
+
 def _room_cpu(
     bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...], orientations: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
@@ -168,29 +177,35 @@ def _room_cpu(
     placements = _placements(np.ascontiguousarray(mask.numpy()), own)
     shape, count = bins.size[:2], len(placements)
     footprints = [(w, d, lengths[0]) for w, d in product(lengths, repeat=2)]
-    most = min(count, max(1, AT_ONCE // (len(footprints) * shape[0] * shape[1])))
+    threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
+    fit_at_once = max(1, AT_ONCE // (len(footprints) * shape[0] * shape[1]))
+    most = max(1, min(-(-count // threads), fit_at_once))
     boxes = np.tile(np.array(footprints, np.int16), (most, 1, 1))
-    masks = np.empty((most, len(footprints), *shape), np.uint8)
-    levels = np.empty((most, *shape), hull_cpu.level_dtype(bins.height))
-    best_level = np.empty(masks.shape, levels.dtype)
-    maps = np.empty((2, most, *shape), np.int16)
     free = bins.height - np.arange(bins.height + 1)
     fitting = (np.array(lengths) <= free[:, None]).sum(1)
     ways = np.array([ORIENTATIONS[o] for o in orientations])
     cells, chance = np.empty((2, count), np.float32)
     heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
-    for start in range(0, count, most or 1):
+
+    def judge(start: int) -> None:
         some = placements[start : start + most]
         n = len(some)
-        _set_down(heightmap, empty_map, own, some, maps[0, :n], maps[1, :n])
-        hull_cpu.hull_mask(
-            maps[0, :n], maps[1, :n], boxes[:n], bins.height, levels[:n], masks[:n], best_level[:n]
-        )
+        maps = np.empty((2, n, *shape), np.int16)
+        _set_down(heightmap, empty_map, own, some, maps[0], maps[1])
+        masks = np.empty((n, len(footprints), *shape), np.uint8)
+        levels = np.empty((n, *shape), hull_cpu.level_dtype(bins.height))
+        best_level = np.empty(masks.shape, levels.dtype)
+        hull_cpu.hull_mask(maps[0], maps[1], boxes[:n], bins.height, levels, masks, best_level)
         _judge(
-            masks[:n].reshape(n, len(footprints), -1),
-            best_level[:n].reshape(n, len(footprints), -1),
+            masks.reshape(n, len(footprints), -1), best_level.reshape(n, len(footprints), -1),
             fitting, ways, cells[start : start + n], chance[start : start + n],
         )  # fmt: skip
+
+    if threads == 1:
+        for start in range(0, count, most):
+            judge(start)
+    else:
+        list(_workers(threads).map(judge, range(0, count, most)))
     room, fits = np.zeros((2, *mask.shape), np.float32)
     _write(own, placements, cells, chance, room, fits)
     return torch.from_numpy(room), torch.from_numpy(fits)
