@@ -29,6 +29,11 @@ def history(run: Path) -> Any:
     return np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=float))
 
 
+def name_of(run: Path) -> str:
+    """What a run is called."""
+    return run.stem if run.is_file() else run.name
+
+
 def draw(runs: list[Path], path: Path) -> None:
     """Two panels, over items and over minutes, a line a run with its 95 % interval."""
     mpl.use("Agg")
@@ -38,7 +43,7 @@ def draw(runs: list[Path], path: Path) -> None:
     for run in runs:
         rows = history(run)
         for panel, x in zip(panels, (rows["items"] / 1e6, rows["seconds"] / 60), strict=True):
-            panel.plot(x, 100 * rows["utilization"], label=run.stem)
+            panel.plot(x, 100 * rows["utilization"], label=name_of(run))
             panel.fill_between(x, 100 * rows["low"], 100 * rows["high"], alpha=0.2)
     for panel, label in zip(panels, ("million items seen", "minutes on one core"), strict=True):
         for name, level in LEVELS:
@@ -67,11 +72,11 @@ def main() -> None:
             when = ["not reached", ""]
             if len(passed):
                 when = [f"{passed[0]['items']:,.0f}", f"{passed[0]['seconds'] / 60:.1f}"]
-            table.append([run.stem, f"{name}, {level} %", *when])
+            table.append([name_of(run), f"{name}, {level} %", *when])
         last = rows[-1]
         half = 50 * (last["high"] - last["low"])
         table.append(
-            [run.stem, f"end: {100 * last['utilization']:.2f} ± {half:.2f} %",
+            [name_of(run), f"end: {100 * last['utilization']:.2f} ± {half:.2f} %",
              f"{last['items']:,.0f}", f"{last['seconds'] / 60:.1f}"]
         )  # fmt: skip
     show("first evaluation clearly above", ["run", "level", "items", "minutes"], table)

@@ -78,7 +78,9 @@ class Bins:
 
     def for_boxes(self, most: int) -> Bins:
         """Bins that hold ``most`` boxes at least; everything else is shared."""
-        more = max(0, most - self.boxes.shape[1])
+        more = most - self.boxes.shape[1]
+        if more <= 0:
+            return self
         boxes, loads = (pad(rows, (0, 0, 0, more)) for rows in (self.boxes, self.loads))
         return replace(self, boxes=boxes, loads=loads)
 

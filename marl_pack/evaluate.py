@@ -29,7 +29,15 @@ from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_polic
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
 from marl_pack.files import check_writable, write_atomically, write_json
-from marl_pack.items import DEFAULT_SIDES, GENERATED, Size, choose_stream, make_stream
+from marl_pack.items import (
+    DEFAULT_SIDES,
+    GENERATED,
+    Size,
+    Stream,
+    choose_stream,
+    independent,
+    make_stream,
+)
 from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
 from marl_pack.sapien_check.packings import Bodies
@@ -355,9 +363,12 @@ def choose_policies(
 
 
 def with_plans(
-    policies: dict[str, Policy], arguments: argparse.Namespace, size: Size
+    policies: dict[str, Policy], arguments: argparse.Namespace, stream: Stream, size: Size
 ) -> dict[str, Policy]:
     """The learned policies, planning as ``--plan`` says; heuristics stay as they are.
+
+    What they imagine to come is what they were trained on; if that was a file, the rows of
+    ``stream``.
 
     Raises:
         ValueError: if the plan cannot be read, or there is no checkpoint to plan with.
@@ -368,13 +379,21 @@ def with_plans(
     plan = Plan.parse(arguments.plan)
     if all(name in POLICIES for name in policies) or arguments.orientation is not None:
         raise ValueError("--plan goes with --policy and a run's folder or checkpoint")
-    futures = make_stream("rs", size, tuple(arguments.sides)).to(arguments.device)
     planned: dict[str, Policy] = {}
     for name, policy in policies.items():
         if name in POLICIES:
             planned[name] = policy
         else:
             found = checkpoint.read(name, arguments.device)
+            game = found["config"]["game"]
+            if game["items"] in GENERATED:
+                try:
+                    learned = make_stream(game["items"], size, tuple(game["sides"]))
+                except ValueError as error:
+                    raise ValueError(f"--plan: what the agents were trained on: {error}") from None
+            else:
+                learned = stream
+            futures = independent(learned).to(arguments.device)
             planned[f"{name}, {plan}"] = make_planner(
                 found, plan, futures, arguments.device, arguments.seed
             )
@@ -425,7 +444,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         arguments.items, tuple(arguments.bin) if arguments.bin else None, tuple(arguments.sides)
     )
     if arguments.plan is not None:
-        policies = with_plans(policies, arguments, size)
+        policies = with_plans(policies, arguments, stream, size)
     episodes = arguments.episodes
     if episodes is None:
         episodes = stream.episodes or EPISODES

@@ -385,6 +385,63 @@ class Sequences:
         return Sequences(self.items.to(device), self.weights.to(device))
 
 
+# --- what may come --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Items drawn i.i.d. from the rows of a table, without end."""
+
+    items: Tensor  # int16 [R, 3]     sides
+    weights: Tensor  # float64 [R]
+    episodes: None = None
+    longest: None = None
+
+    @property
+    def smallest(self) -> int:
+        """Volume of the smallest item."""
+        return int(self.items.long().prod(1).min())
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Shortest and longest side of any item."""
+        return int(self.items.min()), int(self.items.max())
+
+    def start(self, seed: int, episodes: Tensor) -> Tensor:
+        """The episodes' keys, int64 [K]."""
+        return episode_keys(seed, episodes)
+
+    def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Sides int16 [N, 3] and weights float64 [N]."""
+        row = below(mix(state, t), len(self.items))
+        return self.items[row], self.weights[row]
+
+    def to(self, device: torch.device | str) -> Drawn:
+        """The same table on ``device``."""
+        return Drawn(self.items.to(device), self.weights.to(device))
+
+
+def independent(stream: Stream, sequences: int = 500) -> Stream:
+    """Items one by one as probable as in ``stream``, whatever came before them.
+
+    Args:
+        stream: RS, which is so itself; else the rows of its sequences are drawn from.
+        sequences: how many of them, where they have no end.
+    """
+    if isinstance(stream, Uniform):
+        return stream
+    count = stream.episodes or sequences
+    state = stream.start(-1, torch.arange(count))  # episodes that are played have seeds from 0
+    rows = []
+    for t in range(stream.longest or 0):
+        sides, weights = stream.item(state, torch.full((count,), t))
+        held = (sides > 0).all(1)
+        rows.append((sides[held], weights[held]))
+    if not rows:
+        raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
+    return Drawn(*(torch.cat(column) for column in zip(*rows, strict=True)))
+
+
 def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
     """Return (shortest, longest) side as ints.
 

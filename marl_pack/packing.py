@@ -159,7 +159,6 @@ class Packing:
             most = min(most, self.stream.longest)
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
-        self._lengths = probe_lengths(*self.stream.sides)
         self._room: tuple[Tensor, ...] | None = None
         self.reset(seed, first_episode)
 
@@ -189,7 +188,8 @@ class Packing:
         """
         if self._room is None:
             sides = self.candidates(self.items, self.weights).sides
-            self._room = room_left(self.bins, sides, self.mask, self._lengths, self.orientations)
+            lengths = probe_lengths(*self.stream.sides)
+            self._room = room_left(self.bins, sides, self.mask, lengths, self.orientations)
         return self._room
 
     def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from marl_pack.items import (
     check_items,
     cut,
     episode_keys,
+    independent,
     load,
     make_stream,
     mix,
@@ -221,3 +222,22 @@ def test_the_published_sequences_are_read(data_folder: Path) -> None:
         sequences, size = load(data_folder / name)
         assert size == BIN
         assert sequences.episodes == 2100
+
+
+def test_items_one_by_one_are_as_probable_as_in_their_sequences() -> None:
+    rows = [[[2, 2, 2], [3, 3, 3]], [[2, 2, 2], [4, 5, 3]]]
+    drawn = independent(make_stream(rows, BIN))
+    state = drawn.start(3, torch.arange(4000))
+    sides, weights = drawn.item(state, torch.zeros(4000, dtype=torch.int64))
+    assert torch.equal(weights, sides.double().prod(1))
+    share = (sides == 2).all(1).double().mean().item()
+    assert share == pytest.approx(0.5, abs=0.04)
+    assert drawn.sides == (2, 5)
+    assert drawn.smallest == 8
+    assert len({tuple(row) for row in sides.tolist()}) == 3
+    uniform = make_stream("rs", BIN)
+    assert independent(uniform) is uniform
+    pieces = independent(make_stream("cut1", BIN))
+    found, _ = pieces.item(pieces.start(0, torch.arange(500)), torch.full((500,), 7))
+    assert found.min() == 2
+    assert found.max() == 5

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from marl_pack.agents import planning
 from marl_pack.agents.checkpoint import learned_orientation_agent, learned_placement_agent
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.model import Actor, make_actor, make_critic
@@ -29,8 +30,7 @@ def game(n: int, first_episode: int = 0, **options: Any) -> Packing:
 def agents() -> tuple[Actor, Actor]:
     torch.manual_seed(0)
     first, second = (
-        make_actor(name, NETWORK | {"share_trunk": True}, "cpu").eval()
-        for name in ("orientation", "placement")
+        make_actor(name, NETWORK, "cpu").eval() for name in ("orientation", "placement")
     )
     return first, second
 
@@ -124,13 +124,17 @@ def test_orientations_that_turn_a_box_into_itself_count_as_one(
     agents: tuple[Actor, Actor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     planner = Planner(*agents, None, Plan(rollouts=1, top=200), FUTURES)
-    cube = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False)
-    pairs = planner._propose(cube)
-    assert len(set(pairs[0].tolist())) == 4  # its places; the rest repeat the best
-    turned = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, orientations=[2, 5])
-    assert {pair // 16 for pair in planner._propose(turned)[0].tolist()} == {2}
-    heavy = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, com_offset=(0.1, 0, 0))
-    assert len(set(planner._propose(heavy)[0].tolist())) == int(heavy.mask.sum())
+
+    def proposed(**options: Any) -> list[int]:
+        cube = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, **options)
+        pairs, legal = planner._propose(cube, torch.tensor([0]))
+        found: list[int] = pairs[legal].tolist()
+        assert len(set(found)) == len(found)
+        return found
+
+    assert len(proposed()) == 4  # its places
+    assert {pair // 16 for pair in proposed(orientations=[2, 5])} == {2}
+    assert len(proposed(com_offset=(0.1, 0, 0))) == 24
 
 
 def test_a_bin_with_few_pairs_or_at_its_end_is_planned_too(agents: tuple[Actor, Actor]) -> None:
@@ -143,7 +147,19 @@ def test_a_bin_with_few_pairs_or_at_its_end_is_planned_too(agents: tuple[Actor, 
 
 
 @pytest.mark.parametrize(
-    "text", ["rollouts", "rollouts=0", "top=-1", "k=3", "rollouts=2;top=3", ""]
+    "text",
+    [
+        "rollouts",
+        "rollouts=0",
+        "top=-1",
+        "k=3",
+        "rollouts=2;top=3",
+        "",
+        "rollouts=²",
+        "top=3,top=4",
+        "rollouts=99999999999999999999",
+        "rollouts=1000000,top=4",
+    ],
 )
 def test_a_plan_that_cannot_be_read_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="plan"):
@@ -155,8 +171,27 @@ def test_a_plan_is_read_and_shown() -> None:
     assert str(Plan.parse("top=2,depth=4")) == "plan rollouts=16,top=2,depth=4"
 
 
+def test_one_legal_pair_is_taken_without_a_thought(
+    agents: tuple[Actor, Actor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Planner, "_imagine", None)
+    full = Packing(2, (3, 3, 3), [[3, 3, 3]], auto_reset=False)
+    choice = Planner(*agents, None, Plan(rollouts=2, top=4), FUTURES)(full)
+    full.place(*choice)
+    assert (full.bins.filled == 27).all()
+
+
+def test_the_work_may_be_cut_into_parts(
+    agents: tuple[Actor, Actor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = Planner(*agents, None, Plan(rollouts=3, top=5), FUTURES)
+    at_once = torch.stack(planner(game(3)))
+    monkeypatch.setattr(planning, "AT_ONCE", 7 * 36)  # seven bins
+    assert torch.equal(torch.stack(planner(game(3))), at_once)
+
+
 def test_a_depth_needs_a_critic(agents: tuple[Actor, Actor]) -> None:
     with pytest.raises(ValueError, match="critic"):
         Planner(*agents, None, Plan(depth=2), FUTURES)
-    network = NETWORK | {"share_trunk": True}
-    Planner(*agents, make_critic("orientation", network, "cpu", agents[0]), Plan(depth=2), FUTURES)
+    critic = make_critic("orientation", NETWORK, "cpu", agents[0])
+    Planner(*agents, critic, Plan(depth=2), FUTURES)

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -222,12 +223,21 @@ def test_a_run_begins_with_the_weights_of_another(
     capsys.readouterr()
     assert main([*again, "--orientation.network.layers=2", "--output.name=other"]) == 2
     assert "orientation agent has another network: {'layers': 3}" in capsys.readouterr().err
-    frozen = ("--placement.frozen=true", "--placement.policy=dblf", "--output.name=frozen")
-    assert main([*SMALL, *frozen, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]) == 0
-    capsys.readouterr()
-    init = f"--init={tmp_path / 'frozen'}"
-    assert main([*SMALL, init, "--output.name=x", f"--output.folder={tmp_path}"]) == 2
-    assert "no placement agent that has learned" in capsys.readouterr().err
+    kept = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
+    for agent in kept["agents"].values():
+        del agent["network"]["dilation"]  # as in checkpoints of versions that did not have it
+    torch.save(kept, tmp_path / "old.pt")
+    old = (*SMALL, f"--init={tmp_path / 'old.pt'}", f"--output.folder={tmp_path / 'again'}")
+    assert main([*old, "--placement.network.dilation=2", "--output.name=other"]) == 2
+    assert "placement agent has another network: {'dilation': 1}" in capsys.readouterr().err
+    where = f"--output.folder={tmp_path}"
+    for policy in ("dblf", str(tmp_path / "run")):
+        frozen = ("--placement.frozen=true", f"--placement.policy={policy}", "--output.name=frozen")
+        assert main([*SMALL, *frozen, "--ppo.max_iterations=1", where]) == 0
+        capsys.readouterr()
+        assert main([*SMALL, f"--init={tmp_path / 'frozen'}", "--output.name=x", where]) == 2
+        assert "no placement agent that has learned" in capsys.readouterr().err
+        shutil.rmtree(tmp_path / "frozen")
 
 
 def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:

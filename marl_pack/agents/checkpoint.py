@@ -127,9 +127,10 @@ def load_actor(found: Mapping[str, Any], name: str, device: torch.device | str) 
     return actor.eval()
 
 
-def load_critic(found: Mapping[str, Any], name: str, device: torch.device | str) -> Critic:
-    """The critic of one agent. Arguments and errors as for :func:`load_actor`."""
-    actor = load_actor(found, name, device)
+def load_critic(
+    found: Mapping[str, Any], name: str, device: torch.device | str, actor: Actor
+) -> Critic:
+    """The critic of one agent, beside its ``actor``. Else as :func:`load_actor`."""
     agent = found["agents"][name]
     try:
         with torch.random.fork_rng(devices=[]):

@@ -104,6 +104,6 @@ def make_critic(
     agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor | None = None
 ) -> Critic:
     """A critic with fresh weights; one that shares its actor's trunk needs that actor."""
-    trunk = actor.cnns if actor is not None and network["share_trunk"] else None
+    trunk = actor.cnns if actor is not None and Network(**network).share_trunk else None
     critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
     return critic.to(device)

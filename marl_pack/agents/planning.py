@@ -11,6 +11,7 @@ with the same masks: planning cannot choose what the agents may not.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,8 +27,10 @@ from marl_pack.bins import ORIENTATIONS, oriented
 from marl_pack.items import Stream
 from marl_pack.packing import Packing
 
-AT_ONCE = 4096
-"""Imagined games that are played at once, about."""
+AT_ONCE = 1 << 19
+"""Cells of the floors of imagined games that are played at once, about."""
+MOST = 1 << 20
+"""Futures of one decision, at most."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class Plan:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"plan: {name} = {value}, needs 1 or more")
+        if self.rollouts * self.top > MOST:
+            raise ValueError(f"plan: rollouts · top = {self.rollouts * self.top}, at most {MOST:,}")
 
     def __str__(self) -> str:
         named = (f"{k}={v}" for k, v in vars(self).items() if v is not None)
@@ -65,9 +70,12 @@ class Plan:
         found = {}
         for part in text.split(","):
             key, _, value = part.partition("=")
-            if key.strip() not in cls.__dataclass_fields__ or not value.strip().isdigit():
+            key, value = key.strip(), value.strip()
+            if key not in cls.__dataclass_fields__ or not re.fullmatch("[0-9]{1,9}", value):
                 raise ValueError(f"plan {text!r}: {part!r} is none of rollouts=K, top=M, depth=D")
-            found[key.strip()] = int(value)
+            if key in found:
+                raise ValueError(f"plan {text!r}: {key} stands there twice")
+            found[key] = int(value)
         return cls(**found)
 
 
@@ -99,78 +107,90 @@ class Planner:
 
     @torch.inference_mode()
     def __call__(self, game: Packing) -> Choice:
-        """The best pair found in every bin."""
-        chosen = torch.zeros(2, game.n, dtype=torch.int64, device=game.device)
-        alive = game.alive.nonzero().squeeze(1)
-        each = max(1, AT_ONCE // (self.plan.top * self.plan.rollouts))
-        for start in range(0, len(alive), each):
-            which = alive[start : start + each]
-            chosen[:, which] = self._decide(game, which)
-        return chosen[0], chosen[1]
+        """The best pair found in every bin, by sequential halving (Karnin et al. 2013).
 
-    def _decide(self, game: Packing, which: Tensor) -> Tensor:
-        """The pairs for the bins ``which`` [B], int64 [2, B].
-
-        By sequential halving (Karnin et al. 2013): each round plays as many futures in all, and the
-        better half of the pairs goes on to the next.
+        Each round plays as many futures in all, and the better half of the pairs goes on to the
+        next, until one is left.
         """
-        pairs = self._propose(game.branch(which))  # [B, M]
+        chosen = torch.zeros(game.n, dtype=torch.int64, device=game.device)
+        which = game.alive.nonzero().squeeze(1)  # [B]
+        pairs, legal = self._propose(game, which)  # [B, M]
         total, played = torch.zeros(pairs.shape, dtype=torch.float64, device=game.device), 0
-        rounds = max(1, math.ceil(math.log2(pairs.shape[1])))
-        for _ in range(rounds):
-            top = pairs.shape[1]
-            k = max(1, self.plan.top * self.plan.rollouts // (rounds * top))
-            value = self._imagine(
-                game.branch(
-                    which.repeat_interleave(top * k),
-                    self.futures,
-                    self.seed,
-                    self._futures(game, which, top, played, k),
-                ),
-                pairs.repeat_interleave(k, 1).flatten(),
-            )
-            total, played = total + value.view(len(which), top, k).sum(2), played + k
-            better = total.topk(-(-top // 2), 1).indices
-            pairs, total = pairs.gather(1, better), total.gather(1, better)
+        rounds = max(1, math.ceil(math.log2(self.plan.top)))
+        for left in range(rounds, 0, -1):
+            chosen[which] = pairs[:, 0]
+            several = legal.sum(1) > 1
+            which, pairs, legal, total = (x[several] for x in (which, pairs, legal, total))
+            if not len(which):
+                break
+            k = max(1, self.plan.top * self.plan.rollouts // (rounds * pairs.shape[1]))
+            total[legal] += self._sum(game, which, pairs, legal, played, k)
+            played += k
+            kept = 1 if left == 1 else -(-pairs.shape[1] // 2)
+            better = total.masked_fill(~legal, -torch.inf).topk(kept, 1).indices
+            pairs, legal, total = (x.gather(1, better) for x in (pairs, legal, total))
+        chosen[which] = pairs[:, 0]
         cells = game.size[0] * game.size[1]
-        return torch.stack((pairs[:, 0] // cells, pairs[:, 0] % cells))
+        return chosen // cells, chosen % cells
 
-    def _futures(self, game: Packing, which: Tensor, top: int, first: int, k: int) -> Tensor:
-        """Numbers [B · M · k] of ``k`` futures from ``first`` on: for each bin, episode and item.
+    def _sum(
+        self, game: Packing, which: Tensor, pairs: Tensor, legal: Tensor, first: int, k: int
+    ) -> Tensor:
+        """What ``k`` futures, from number ``first`` on, make of each legal pair: float64 [L].
 
-        One set for all pairs.
+        Args:
+            game: the bins.
+            which: int64 [B], bins.
+            pairs: int64 [B, M].
+            legal: bool [B, M], of which L are true.
         """
+        row, rank = legal.nonzero().unbind(1)
+        at_once = max(1, AT_ONCE // (game.size[0] * game.size[1]))
+        numbers = self._futures(game, which, first, k)[row].flatten()  # [L · k]
+        each = row.repeat_interleave(k), rank.repeat_interleave(k), numbers
+        values = [
+            self._imagine(game.branch(which[r], self.futures, self.seed, f), pairs[r, m])
+            for r, m, f in zip(*(torch.split(x, at_once) for x in each), strict=True)
+        ]
+        return torch.cat(values).view(-1, k).sum(1)
+
+    def _futures(self, game: Packing, which: Tensor, first: int, k: int) -> Tensor:
+        """Numbers int64 [B, k] of futures: others for each bin, episode, item and ``first``."""
         decision = game.episode[which] * game.bins.boxes.shape[1] + game.t[which]
-        most = self.plan.top * self.plan.rollouts
-        numbers = decision * most + first
-        each = numbers[:, None, None] + torch.arange(k, device=which.device)
-        return each.expand(-1, top, -1).flatten()
+        numbers = decision * self.plan.top * self.plan.rollouts + first
+        return numbers[:, None] + torch.arange(k, device=which.device)
 
-    def _propose(self, game: Packing) -> Tensor:
-        """The M most probable pairs ``o · W · D + cell``, int64 [B, M].
+    def _propose(self, game: Packing, which: Tensor) -> tuple[Tensor, Tensor]:
+        """The M most probable pairs ``o · W · D + cell`` of the bins ``which`` [B], int64 [B, M].
 
-        Where fewer are legal, the best one stands in for the rest.
+        With bool [B, M]: false from where fewer than M are legal on.
         """
-        ways = len(ORIENTATIONS)
-        cells = game.size[0] * game.size[1]
-        first = self._log_probs(
-            self.orientation_agent,
-            orientation.observe(game, self.orientation_agent.cnns.planes),
-        )  # [B, 6]
-        every = torch.arange(game.n, device=game.device).repeat_interleave(ways)
-        turned = torch.arange(ways, device=game.device).repeat(game.n)
-        second = self._log_probs(
-            self.placement_agent,
-            placement.observe(game.branch(every), self.placement_agent.cnns.planes, turned),
-        )  # [B · 6, W · D]
-        both = (first[:, :, None] + second.view(game.n, ways, cells)).double().exp()
-        legal = game.mask.flatten(2)
-        same = _twins(game)
-        both = torch.einsum("noe,nec->noc", same.to(both), both * legal)
-        before = torch.einsum("noe,nec->noc", same.tril(-1).to(both), legal.to(both))
-        both = both.masked_fill(~legal | (before > 0), 0).flatten(1)
+        ways, cells = len(ORIENTATIONS), game.size[0] * game.size[1]
+        every = torch.arange(ways, device=game.device)
+        probable = [torch.zeros(0, ways, cells, dtype=torch.float64, device=game.device)]
+        for some in torch.split(which, max(1, AT_ONCE // (ways * cells))):
+            each = game.branch(some)
+            first = self._log_probs(
+                self.orientation_agent,
+                orientation.observe(each, self.orientation_agent.cnns.planes),
+            )  # [b, 6]
+            second = self._log_probs(
+                self.placement_agent,
+                placement.observe(
+                    each.branch(torch.arange(len(some)).repeat_interleave(ways)),
+                    self.placement_agent.cnns.planes,
+                    every.repeat(len(some)),
+                ),
+            )  # [b · 6, W · D]
+            both = first[:, :, None] + second.view(-1, ways, cells)
+            probable.append(both.double().exp())
+        legal = game.mask[which].flatten(2)
+        same = _twins(game)[which].double()
+        both = torch.einsum("noe,nec->noc", same, torch.cat(probable) * legal)
+        before = torch.einsum("noe,nec->noc", same.tril(-1), legal.double())
+        both = both.masked_fill(~legal | (before > 0), -1).flatten(1)
         found, pairs = both.topk(min(self.plan.top, both.shape[1]))
-        return torch.where(found > 0, pairs, pairs[:, :1])
+        return pairs, found >= 0
 
     @staticmethod
     def _log_probs(actor: Actor, seen: Mapping[str, Tensor]) -> Tensor:
@@ -179,7 +199,11 @@ class Planner:
         return actor.output_distribution_params[0]
 
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
-        """What share of each bin is full in the end [N], by the agents or their critic's word."""
+        """What share of each bin is full in the end [N].
+
+        With a depth, of what comes after it the critic's word counts: the return (Eq. 5), so that
+        the space that may yet be wasted is taken off.
+        """
         cells = game.size[0] * game.size[1]
         value = torch.zeros(game.n, dtype=torch.float64, device=game.device)
         rows = torch.arange(game.n, device=game.device)
@@ -229,10 +253,16 @@ def make_planner(
         device: of the games.
 
     Raises:
-        ValueError: if not both agents are learned ones.
+        ValueError: if not both agents are learned ones, or their critic cannot speak for a depth.
     """
+    first, second = (load_actor(found, name, device) for name in ("orientation", "placement"))
     critic = None
     if plan.depth is not None:
-        critic = load_critic(found, "orientation", device)
-    first, second = (load_actor(found, name, device) for name in ("orientation", "placement"))
+        alpha, gamma = found["config"]["game"]["alpha"], found["config"]["ppo"]["gamma"]
+        if (alpha, gamma) != (1, 1):
+            raise ValueError(
+                f"plan: a depth needs agents trained with game.alpha = 1 and ppo.gamma = 1, whose "
+                f"critic speaks of shares of the bin, not {alpha:g} and {gamma:g}"
+            )
+        critic = load_critic(found, "orientation", device, first)
     return Planner(first, second, critic, plan, futures, seed)

@@ -12,7 +12,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import marl_pack
 from marl_pack.agents import checkpoint
 from marl_pack.agents.policy import Policy
 from marl_pack.agents.ppo import PackingPPO
+from marl_pack.agents.trunk import Network
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
@@ -270,12 +271,16 @@ class Runner(OnPolicyRunner):
         """
         for name, ppo in self.alg.learners.items():
             agent = found["agents"].get(name, {})
-            if "network" not in agent:
+            if "critic_state_dict" not in agent:
                 raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
-            mine = self.cfg["agents"][name]["network"]
-            if other := {k: v for k, v in agent["network"].items() if mine.get(k) != v}:
+            mine, theirs = (
+                asdict(Network(**network))
+                for network in (self.cfg["agents"][name]["network"], agent["network"])
+            )
+            if other := {key: value for key, value in theirs.items() if mine[key] != value}:
                 raise ValueError(
-                    f"init: the checkpoint's {name} agent has another network: {other}"
+                    f"init: the checkpoint's {name} agent has another network: {other}; begin with "
+                    "the same (--config with the settings of its run)"
                 )
             ppo.actor.load_state_dict(agent["actor_state_dict"])
             ppo.critic.load_state_dict(agent["critic_state_dict"])

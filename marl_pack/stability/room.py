@@ -120,17 +120,17 @@ def _set_down(
 
 @njit(cache=True, nogil=True)
 def _judge(
-    masks: Any, best_level: Any, fitting: Any, ways: Any, cells: Any, chance: Any
-) -> None:  # fmt: skip
+    masks: Any, best_level: Any, lengths: int, fitting: Any, ways: Any, cells: Any, chance: Any
+) -> None:
     """Both numbers of each placement.
 
     Args:
         masks, best_level: [K, L · L, W · D], of boxes of the least height on each footprint.
+        lengths: how many, L.
         fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
         ways: int64 [A, 3], the orientations the next item may have.
         cells, chance: float32 [K], written.
     """
-    lengths = fitting[0]  # all fit above the floor
     tallest = np.empty((lengths, lengths), np.int64)  # of how many lengths a box fits somewhere
     item = np.empty(3, np.int64)
     items = lengths**3
@@ -198,7 +198,7 @@ def _room_cpu(
         hull_cpu.hull_mask(maps[0], maps[1], boxes[:n], bins.height, levels, masks, best_level)
         _judge(
             masks.reshape(n, len(footprints), -1), best_level.reshape(n, len(footprints), -1),
-            fitting, ways, cells[start : start + n], chance[start : start + n],
+            len(lengths), fitting, ways, cells[start : start + n], chance[start : start + n],
         )  # fmt: skip
 
     if threads == 1:
@@ -226,7 +226,8 @@ def _room_torch(
     inverse = [sorted(range(3), key=ORIENTATIONS[o].__getitem__) for o in orientations]
     turned = torch.stack([index.permute(axes).flatten() for axes in inverse], 1)
     placements = mask.nonzero()
-    for some in torch.split(placements, max(1, AT_ONCE // (len(boxes) * width * depth))):
+    at_once = AT_ONCE if device.type == "cpu" else AT_ONCE << 6
+    for some in torch.split(placements, max(1, at_once // (len(boxes) * width * depth))):
         b, a, x, y = some.T
         box = sides[b, a]
         window = footprint(width, depth, box, x * depth + y)

@@ -1,0 +1,96 @@
+"""What planning gains and takes: ``python -m benchmarks.planning models/rs.pt``.
+
+Plays the same generated sequences with each plan and prints mean utilization, the gain over the
+agents without a plan episode by episode, each with its 95 % interval, and the time of a decision:
+in the mean of the many bins that the evaluation plays at once, and for a single bin, as a robot
+waits for it. Wall time: leave the machine to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+
+from benchmarks.timing import show
+from marl_pack.agents import checkpoint
+from marl_pack.agents.planning import Plan, make_planner
+from marl_pack.agents.policy import Policy
+from marl_pack.evaluate import play
+from marl_pack.items import make_stream
+from marl_pack.packing import Packing
+
+PLANS = (
+    "rollouts=16,top=4,depth=1",
+    "rollouts=32,top=4,depth=1",
+    "rollouts=32,top=8,depth=1",
+    "rollouts=16,top=4,depth=2",
+)
+
+
+def spread(values: NDArray[np.float64]) -> str:
+    """Mean and half of its 95 % interval, in per cent of the bin."""
+    low, high = stats.ttest_1samp(100 * values, 0.0).confidence_interval(0.95)
+    return f"{100 * values.mean():+.2f} ± {(high - low) / 2:.2f}"
+
+
+def main() -> None:
+    """The table."""
+    options = argparse.ArgumentParser(prog="python -m benchmarks.planning")
+    options.add_argument("checkpoint", type=Path, help="trained on generated RS")
+    options.add_argument("--plans", nargs="+", default=PLANS, metavar="rollouts=K,top=M,depth=D")
+    options.add_argument("--episodes", type=int, default=500)
+    options.add_argument("--seed", type=int, default=5, help="of the sequences")
+    options.add_argument("--threads", type=int, default=2)
+    chosen = options.parse_args()
+    torch.set_num_threads(chosen.threads)
+    found = checkpoint.read(chosen.checkpoint)
+    settings = found["config"]["game"]
+    size = tuple(settings["bin"])
+    stream = make_stream("rs", size, tuple(settings["sides"]))
+
+    def game(n: int, first_episode: int) -> Packing:
+        return Packing(
+            n, size, stream, seed=chosen.seed, first_episode=first_episode, auto_reset=False
+        )
+
+    def alone(policy: Policy) -> float:
+        """Seconds of a decision for a single bin: the median over two episodes."""
+        taken = []
+        for episode in range(3):
+            bin_ = game(1, episode)
+            while bin_.alive.any():
+                start = time.perf_counter()
+                choice = policy(bin_)
+                taken.append((episode, time.perf_counter() - start))
+                bin_.place(*choice)
+        return float(np.median([seconds for episode, seconds in taken if episode]))
+
+    plain: NDArray[np.float64] | None = None
+    table = []
+    for text in ("", *chosen.plans):
+        policy = (
+            make_planner(found, Plan.parse(text), stream) if text
+            else checkpoint.load_policy(found, "cpu", 0)
+        )  # fmt: skip
+        played = play(policy, game, chosen.episodes)
+        reached = played.utilization
+        plain = reached if plain is None else plain
+        table.append([
+            text or "none", spread(reached).lstrip("+"), spread(reached - plain) if text else "",
+            f"{1000 * played.seconds / played.packed.sum():.1f}", f"{1000 * alone(policy):.1f}",
+        ])  # fmt: skip
+        print(*table[-1], sep="  ", flush=True)
+    show(
+        f"planning, {chosen.episodes} episodes, {chosen.threads} threads",
+        ["plan", "utilization %", "gain", "ms a decision", "ms, one bin alone"], table,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
