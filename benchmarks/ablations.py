@@ -16,10 +16,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import yaml
 from scipy import stats
 
 from benchmarks.learning_curve import history
 from benchmarks.timing import show
+from marl_pack.config import parse
 
 CONFIGS = Path(__file__).parent.parent / "configs" / "ablations"
 SEEDS = (0, 1, 2)
@@ -28,12 +30,16 @@ SEEDS = (0, 1, 2)
 def train(name: str, options: list[str], seed: int, folder: Path) -> Path:
     """Train one run to its end, unless it is there; returns its folder."""
     run = folder / f"{name}_{seed}"
+    options = [*options, "--seed", str(seed), "--output.name", run.name,
+               "--output.folder", str(folder)]  # fmt: skip
     command = [sys.executable, "-m", "marl_pack.train"]
     if (run / "latest.pt").is_file():
+        held = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        if held != parse(options)[0].to_dict():
+            raise SystemExit(f"{run}: was trained with other settings; give another --folder")
         command += ["--resume", str(run)]
     else:
-        command += [*options, "--seed", str(seed), "--output.name", run.name,
-                    "--output.folder", str(folder)]  # fmt: skip
+        command += options
     subprocess.run(command, check=True)
     return run
 
@@ -45,7 +51,7 @@ def main() -> None:
     options.add_argument("--folder", type=Path, default=Path("runs/ablations"))
     options.add_argument("--config", type=Path, help="train this config, changed, in their place")
     options.add_argument("--changes", nargs="+", default=[], metavar="OPTIONS",
-                         help='of marl_pack.train, a string each; "" for no change')  # fmt: skip
+                         help='of marl_pack.train, as "--seed 1"; "" for no change')  # fmt: skip
     options.add_argument("--every", default="", metavar="OPTIONS", help="options of every run")
     chosen = options.parse_args()
     if bool(chosen.config) != bool(chosen.changes):
@@ -55,6 +61,8 @@ def main() -> None:
             "_".join((chosen.config.stem, *re.findall(r"[\w.]+", change))): (chosen.config, change)
             for change in chosen.changes
         }
+        if len(runs) < len(chosen.changes):
+            options.error("--changes: two of them have the same words")
     else:
         named = [CONFIGS / f"{n}.yaml" for n in chosen.names] or sorted(CONFIGS.glob("*.yaml"))
         runs = {config.stem: (config, "") for config in named}

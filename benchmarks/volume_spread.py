@@ -20,7 +20,7 @@ from scipy import stats
 from benchmarks.timing import show
 from marl_pack import evaluate
 from marl_pack.agents import checkpoint
-from marl_pack.agents.heuristics import POLICIES, make_policy
+from marl_pack.agents.heuristics import POLICIES
 from marl_pack.items import Size, Stream, choose_stream
 from marl_pack.packing import Packing
 
@@ -37,8 +37,7 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
     """
     state = stream.start(seed, torch.arange(episodes))
     longest = stream.longest
-    if longest is None:
-        raise ValueError("the sequences have no end: give a file of items")
+    assert longest is not None, "a file's sequences have an end"
     volumes = []
     for t in range(longest):
         sides, _ = stream.item(state, torch.full((episodes,), t))
@@ -50,10 +49,7 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
 
 def play(policy: str, stream: Stream, size: Size, episodes: int) -> NDArray[np.float64]:
     """Utilization of each episode [E]."""
-    chosen = (
-        make_policy(policy) if policy in POLICIES
-        else checkpoint.load_policy(checkpoint.read(policy), "cpu", 0)
-    )  # fmt: skip
+    chosen = checkpoint.find_policy(policy, "cpu", 0)
 
     def game(n: int, first: int) -> Packing:
         return Packing(n, size, stream, auto_reset=False, first_episode=first)
@@ -71,7 +67,8 @@ def main() -> None:
     chosen = options.parse_args()
     torch.set_num_threads(1)
     stream, size = choose_stream(chosen.items, None, (2, 5))
-    assert stream.episodes is not None, "a file's sequences are counted"
+    if stream.episodes is None:
+        options.error(f"--items {chosen.items}: has sequences without end; give a file")
     spread = volume_spread(stream, stream.episodes, 0)
     edges = np.quantile(spread, np.linspace(0, 1, GROUPS + 1))
     group = np.clip(np.searchsorted(edges, spread, side="right") - 1, 0, GROUPS - 1)

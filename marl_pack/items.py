@@ -439,7 +439,8 @@ def independent(stream: Stream, sequences: int = 500) -> Stream:
         rows.append((sides[held], weights[held]))
     if not rows:
         raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
-    return Drawn(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    boxes, masses = zip(*rows, strict=True)
+    return Drawn(torch.cat(boxes), torch.cat(masses))
 
 
 def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
