@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
 
 from benchmarks.timing import show
 from marl_pack.agents import checkpoint
 from marl_pack.agents.planning import Plan, make_planner
 from marl_pack.agents.policy import Policy
-from marl_pack.evaluate import play
+from marl_pack.evaluate import interval, play
 from marl_pack.items import make_stream
 from marl_pack.packing import Packing
 
@@ -35,7 +34,7 @@ PLANS = (
 
 def spread(values: NDArray[np.float64]) -> str:
     """Mean and half of its 95 % interval, in per cent of the bin."""
-    low, high = stats.ttest_1samp(100 * values, 0.0).confidence_interval(0.95)
+    low, high = interval(100 * values) or (np.nan, np.nan)
     return f"{100 * values.mean():+.2f} ± {(high - low) / 2:.2f}"
 
 

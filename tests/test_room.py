@@ -18,12 +18,13 @@ GAMES = (
     {"orientations": (0, 3)},
     {"size": (16, 12, 20), "sides": (3, 12)},
     {"size": (10, 10, 4), "items": "cut1"},
+    {"com_offset": (0.3, 0.2, 0.0)},
     {"size": (14, 6, 6), "items": [[2, 2, 2], [13, 2, 2], [3, 4, 5]] * 4},
 )
 
 
 def in_play(n: int, steps: int, **settings: object) -> Packing:
-    game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]
+    game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]  # a game's options have many types
     policy = make_policy("random", seed=1)
     for _ in range(steps):
         game.place(*policy(game))

@@ -77,20 +77,18 @@ def _same(sides: Any, b: int, a: int, e: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _placements(mask: Any, sides: Any) -> Any:
-    """Bin, orientation and cell of every legal placement, int64 [K, 4]; none that has a twin."""
+    """Bin, orientation and cell of every legal placement, int64 [K, 4], once if alike."""
     n, ways, width, depth = mask.shape
     found = np.empty((mask.size, 4), np.int64)
     k = 0
     for b in range(n):
         for a in range(ways):
-            twin = False
-            for e in range(a):
-                twin |= _same(sides, b, a, e)
-            if twin:
-                continue
             for x in range(width):
                 for y in range(depth):
-                    if mask[b, a, x, y]:
+                    wanted = mask[b, a, x, y]
+                    for e in range(a):
+                        wanted &= not (mask[b, e, x, y] and _same(sides, b, a, e))
+                    if wanted:
                         found[k, 0], found[k, 1], found[k, 2], found[k, 3] = b, a, x, y
                         k += 1
     return found[:k]
@@ -156,12 +154,14 @@ def _judge(
 
 
 @njit(cache=True, nogil=True)
-def _write(sides: Any, placements: Any, cells: Any, chance: Any, room: Any, fits: Any) -> None:
-    """Put the numbers where they belong, twins' too."""
+def _write(
+    mask: Any, sides: Any, placements: Any, cells: Any, chance: Any, room: Any, fits: Any
+) -> None:
+    """Put the numbers where they belong, in all placements that are the same."""
     for k in range(placements.shape[0]):
         b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
         for e in range(a, sides.shape[1]):
-            if _same(sides, b, a, e):
+            if mask[b, e, x, y] and _same(sides, b, a, e):
                 room[b, e, x, y], fits[b, e, x, y] = cells[k], chance[k]
 
 
@@ -173,8 +173,8 @@ def _workers(threads: int) -> ThreadPoolExecutor:
 def _room_cpu(
     bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...], orientations: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
-    own = np.ascontiguousarray(sides.numpy())
-    placements = _placements(np.ascontiguousarray(mask.numpy()), own)
+    own, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
+    placements = _placements(legal, own)
     shape, count = bins.size[:2], len(placements)
     footprints = [(w, d, lengths[0]) for w, d in product(lengths, repeat=2)]
     threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
@@ -207,7 +207,7 @@ def _room_cpu(
     else:
         list(_workers(threads).map(judge, range(0, count, most)))
     room, fits = np.zeros((2, *mask.shape), np.float32)
-    _write(own, placements, cells, chance, room, fits)
+    _write(legal, own, placements, cells, chance, room, fits)
     return torch.from_numpy(room), torch.from_numpy(fits)
 
 
