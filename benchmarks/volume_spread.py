@@ -21,7 +21,8 @@ from benchmarks.timing import show
 from marl_pack import evaluate
 from marl_pack.agents import checkpoint
 from marl_pack.agents.heuristics import POLICIES
-from marl_pack.items import Size, Stream, choose_stream
+from marl_pack.bins import Size
+from marl_pack.items import Stream, choose_stream
 from marl_pack.packing import Packing
 
 GROUPS = 8

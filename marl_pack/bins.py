@@ -20,6 +20,9 @@ from numba import njit
 from torch import Tensor
 from torch.nn.functional import pad
 
+Size = tuple[int, int, int]
+"""A bin's sides (W, D, H) in cells."""
+
 ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
     (0, 1, 2),
     (1, 0, 2),
@@ -52,7 +55,7 @@ class Bins:
     height: int  # H
 
     @property
-    def size(self) -> tuple[int, int, int]:
+    def size(self) -> Size:
         """(W, D, H)."""
         return self.heightmap.shape[1], self.heightmap.shape[2], self.height
 
@@ -101,7 +104,7 @@ def _is_number(value: object) -> bool:
     return math.isfinite(float(value))
 
 
-def check_size(size: tuple[int, int, int]) -> tuple[int, int, int]:
+def check_size(size: Size) -> Size:
     """Return ``size`` as three ints.
 
     Raises:
@@ -119,7 +122,7 @@ def check_size(size: tuple[int, int, int]) -> tuple[int, int, int]:
 
 def empty(
     n: int,
-    size: tuple[int, int, int],
+    size: Size,
     max_boxes: int | None = None,
     device: torch.device | str = "cpu",
 ) -> Bins:

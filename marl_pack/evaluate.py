@@ -27,12 +27,11 @@ from scipy import stats
 
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
 from marl_pack.agents.policy import Policy, in_turns
-from marl_pack.bins import check_device
+from marl_pack.bins import Size, check_device
 from marl_pack.files import check_writable, write_atomically, write_json
 from marl_pack.items import (
     DEFAULT_SIDES,
     GENERATED,
-    Size,
     Stream,
     choose_stream,
     independent,
@@ -61,7 +60,7 @@ file's own or 10 x 10 x 10."""
 class Episodes:
     """What a policy did in E episodes, one row each."""
 
-    size: tuple[int, int, int]  # W, D, H
+    size: Size  # W, D, H
     utilization: NDArray[np.float64]  # [E]
     packed: NDArray[np.int64]  # [E]          boxes in the bin at the end
     boxes: NDArray[np.int16]  # [E, M, 6]     x, y, z, w, d, h in order of placement, then zeros

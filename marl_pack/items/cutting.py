@@ -1,0 +1,142 @@
+"""Cutting the bin itself into items (Zhao et al. 2021, sec. 5): a perfect packing is known."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from marl_pack.bins import Size, check_size
+from marl_pack.items.counting import draw, episode_keys
+
+
+def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
+    """Return (shortest, longest) side as ints.
+
+    Raises:
+        ValueError: unless they are whole numbers with 1 ≤ shortest ≤ longest.
+    """
+    pair = tuple(sides)
+    if len(pair) != 2 or any(int(s) != s for s in pair) or not 1 <= pair[0] <= pair[1]:
+        raise ValueError(f"sides {sides!r}: need two whole numbers, 1 ≤ shortest ≤ longest")
+    return int(pair[0]), int(pair[1])
+
+
+@njit(cache=True)
+def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: Any) -> int:
+    """Cut the bin until every edge is in low … high; rows x, y, z, w, d, h. Returns how many.
+
+    Pieces come in the order in which they are finished.
+    """
+    waiting[0, :3] = 0
+    waiting[0, 3:] = size
+    left, n = int(size.max() > high), 0
+    if left == 0:
+        pieces[0] = waiting[0]
+        n = 1
+    parts = np.empty((2, 6), np.int64)
+    while left > 0:
+        chosen = draw(state, left)
+        parts[:] = waiting[chosen]
+        left -= 1
+        waiting[chosen] = waiting[left]
+        edges = parts[0, 3:].copy()
+        cuts = 0  # an edge can be cut in two, each at least low, in so many places
+        for axis in range(3):
+            if edges[axis] > high:
+                cuts += edges[axis] - 2 * low + 1
+        pick = draw(state, cuts)
+        for axis in range(3):
+            if edges[axis] > high:
+                places = edges[axis] - 2 * low + 1
+                if 0 <= pick < places:
+                    parts[0, 3 + axis] = low + pick
+                    parts[1, axis] += low + pick
+                    parts[1, 3 + axis] = edges[axis] - low - pick
+                pick -= places
+        for part in parts:
+            if part[3:].max() > high:
+                waiting[left] = part
+                left += 1
+            else:
+                pieces[n] = part
+                n += 1
+    return n
+
+
+@njit(cache=True)
+def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out: Any) -> None:
+    """CUT-2: draw uniformly among the pieces whose whole floor is built, until none is left."""
+    height = np.zeros(shape, np.int64)
+    left = np.arange(n)
+    ready = np.empty(n, np.int64)
+    for k in range(n):
+        count = 0
+        for i in range(n - k):
+            x, y, z, w, d, _ = pieces[left[i]]
+            if (height[x : x + w, y : y + d] == z).all():
+                ready[count] = i
+                count += 1
+        i = ready[draw(state, count)]
+        out[k] = pieces[left[i]]
+        x, y, z, w, d, h = out[k]
+        height[x : x + w, y : y + d] = z + h
+        left[i : n - k - 1] = left[i + 1 : n - k].copy()
+
+
+@njit(cache=True, nogil=True)
+def _cut_all(keys: Any, size: Any, low: int, high: int, order: int, out: Any) -> None:
+    most = out.shape[1]
+    pieces, waiting = np.empty((most, 6), np.int64), np.empty((most, 6), np.int64)
+    state = np.empty(1, np.uint64)
+    for b in range(keys.size):
+        state[0] = np.uint64(keys[b])
+        n = _cut_bin(size, low, high, state, waiting, pieces)
+        if order == 2:
+            _stacking_order(pieces, n, (size[0], size[1]), state, out[b])
+        else:
+            out[b, :n] = pieces[:n][np.argsort(pieces[:n, 2], kind="mergesort")]
+
+
+def cut(
+    size: Size, order: Literal[1, 2], seed: int, episodes: Tensor, sides: tuple[int, int]
+) -> Tensor:
+    """Sequences made by cutting the bin, with their perfect solution.
+
+    Start with the bin; while there are pieces with an edge longer than ``high``, choose one of them
+    and one of its possible cuts, across such an edge at a position in [low, edge - low], both
+    uniformly, and replace it by the two parts. With pieces in the order in which they are finished,
+    neighbours in a sequence are as often alike as in the published CUT-1.
+
+    Args:
+        size: (W, D, H).
+        order: 1 sorts the pieces by the height of their bottom face; 2 repeatedly draws one whose
+            whole floor is built.
+        seed: of the sequences.
+        episodes: int64 [K], which ones.
+        sides: (low, high), shortest and longest edge; ``high ≥ 2 · low - 1`` and the bin's sides
+            at least ``low``.
+
+    Returns:
+        int16 [K, L, 6] on the CPU, rows x, y, z, w, d, h in the order of arrival, then zeros. The
+        boxes fill the bin exactly, and in this order each finds its floor complete.
+
+    Raises:
+        ValueError: if the bin cannot be cut into such pieces.
+    """
+    low, high = check_sides(sides)
+    size = check_size(size)
+    if high < 2 * low - 1 or min(size) < low:
+        raise ValueError(
+            f"cutting {size} into edges {low}..{high}: needs a longest edge of at least "
+            f"{2 * low - 1} (twice the shortest, less one) and bin sides of at least {low}"
+        )
+    keys = episode_keys(seed, episodes.cpu()).numpy()
+    most = int(np.prod([s // low for s in size]))
+    out = np.zeros((len(keys), most, 6), np.int64)
+    _cut_all(keys, np.array(size), low, high, order, out)
+    longest = int((out[..., 3] > 0).sum(1).max(initial=1))
+    return torch.from_numpy(out[:, :longest].astype(np.int16))
