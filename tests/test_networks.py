@@ -5,8 +5,8 @@ import torch
 
 from marl_pack.agents import joint, orientation, placement
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor
-from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes
+from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor, make_critic
+from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes, widen
 from marl_pack.packing import Packing
 
 SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
@@ -159,3 +159,30 @@ def test_a_critic_teaches_the_shared_trunk() -> None:
 def test_an_impossible_network_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="network: "):
         Network(**wrong)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("shortcut", [False, True])
+@pytest.mark.parametrize("share", [False, True])
+def test_a_widened_network_computes_what_it_did(agent: str, shortcut: bool, share: bool) -> None:
+    shape = {**SMALL, "shortcut": shortcut, "context": True, "share_trunk": share}
+    held = shape | {"planes": ["waste", "room"]}
+    wanted = shape | {"planes": ["filled", "room", "mask", "waste"]}
+    game = Packing(4, (6, 5, 7), sides=(2, 4))
+    game.place(*make_policy("random", seed=0)(game))
+    seen = observed(agent, game, PLANES)
+    answers = []
+    networks = []
+    for network in (held, wanted):
+        actor = make_actor(agent, network, "cpu")
+        networks.append((actor, make_critic(agent, network, "cpu", actor)))
+    for narrow, wide in zip(*networks, strict=True):
+        weights = narrow.state_dict()
+        shapes = Network(**held), Network(**wanted)
+        wide.load_state_dict(widen(weights, *shapes, AGENTS[agent].WAYS))
+    for actor, critic in networks:
+        actor(seen, stochastic_output=True)
+        answers.append((actor.output_distribution_params[0], critic(seen)))
+    assert answers[0][1].std() > 0
+    for narrow_answer, wide_answer in zip(*answers, strict=True):
+        assert torch.allclose(narrow_answer, wide_answer, atol=1e-6)

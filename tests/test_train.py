@@ -223,6 +223,11 @@ def test_a_run_begins_with_the_weights_of_another(
     capsys.readouterr()
     assert main([*again, "--orientation.network.layers=2", "--output.name=other"]) == 2
     assert "orientation agent has another network: {'layers': 3}" in capsys.readouterr().err
+    more = "--placement.network.planes=[filled,mask,rest,waste]"
+    assert main([*again, more, "--ppo.max_iterations=1", "--output.name=more"]) == 0
+    fewer = (f"--init={tmp_path / 'again' / 'more'}", "--ppo.max_iterations=1")
+    assert main([*again, *fewer, "--output.name=fewer"]) == 2
+    assert "placement agent has another network: {'planes': [" in capsys.readouterr().err
     kept = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
     for agent in kept["agents"].values():
         del agent["network"]["dilation"]  # as in checkpoints of versions that did not have it

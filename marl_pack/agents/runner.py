@@ -24,9 +24,10 @@ from torch.utils._pytree import tree_map
 
 import marl_pack
 from marl_pack.agents import checkpoint
+from marl_pack.agents.model import AGENTS
 from marl_pack.agents.policy import Policy
 from marl_pack.agents.ppo import PackingPPO
-from marl_pack.agents.trunk import Network
+from marl_pack.agents.trunk import Network, widen
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
@@ -267,23 +268,28 @@ class Runner(OnPolicyRunner):
             found: what :func:`marl_pack.agents.checkpoint.read` gave.
 
         Raises:
-            ValueError: if an agent that learns here did not there, or has another network.
+            ValueError: if an agent that learns here did not there, or has another network (it may
+                see more planes here: those weigh 0 at first).
         """
         for name, ppo in self.alg.learners.items():
             agent = found["agents"].get(name, {})
             if "critic_state_dict" not in agent:
                 raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
             mine, theirs = (
-                asdict(Network(**network))
+                Network(**network)
                 for network in (self.cfg["agents"][name]["network"], agent["network"])
             )
-            if other := {key: value for key, value in theirs.items() if mine[key] != value}:
+            more = set(theirs.planes) <= set(mine.planes)
+            wanted = asdict(mine) | ({"planes": theirs.planes} if more else {})
+            held = asdict(theirs).items()
+            if other := {key: value for key, value in held if wanted[key] != value}:
                 raise ValueError(
                     f"init: the checkpoint's {name} agent has another network: {other}; begin with "
-                    "the same (--config with the settings of its run)"
+                    "the same, or one that sees more planes (--config with the settings of its run)"
                 )
-            ppo.actor.load_state_dict(agent["actor_state_dict"])
-            ppo.critic.load_state_dict(agent["critic_state_dict"])
+            for part in ("actor", "critic"):
+                weights = widen(agent[f"{part}_state_dict"], theirs, mine, AGENTS[name].WAYS)
+                getattr(ppo, part).load_state_dict(weights)
 
     def resume(self, found: Mapping[str, Any]) -> None:
         """Go on exactly from the checkpoint of a run with the same settings.

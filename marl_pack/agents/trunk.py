@@ -101,10 +101,15 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
     return torch.cat(seen, 1).contiguous(memory_format=torch.channels_last)
 
 
+def channels_of(planes: list[str], ways: int) -> list[tuple[str, int]]:
+    """The channels :func:`input_planes` makes for A = ``ways`` orientations: (plane, which)."""
+    several = {"paper": 4, "solid": 1, "filled": 1, "room": ways + 1}
+    return [(plane, k) for plane in ["paper", *planes] for k in range(several.get(plane, ways))]
+
+
 def count_planes(planes: list[str], ways: int) -> int:
-    """Channels that :func:`input_planes` makes for A = ``ways`` orientations."""
-    channels = {"solid": 1, "filled": 1, "room": ways + 1}
-    return 4 + sum(channels.get(plane, ways) for plane in planes)
+    """How many channels :func:`input_planes` makes for A = ``ways`` orientations."""
+    return len(channels_of(planes, ways))
 
 
 def count_features(network: Network, ways: int) -> int:
@@ -165,6 +170,39 @@ class Trunk(nn.Module):
             return kept[1]
         features: Tensor = self(observation)
         return features
+
+
+def widen(
+    weights: Mapping[str, Tensor], held: Network, wanted: Network, ways: int
+) -> dict[str, Tensor]:
+    """An actor's or critic's weights for a network that sees more planes: those weigh 0.
+
+    Args:
+        weights: a state_dict of the network ``held``.
+        held: its shape.
+        wanted: the same shape with every plane of ``held`` among its own.
+        ways: orientations A for which the extra planes come.
+
+    Returns:
+        A state_dict of ``wanted``, which computes what ``held`` does.
+    """
+    old, new = (channels_of(network.planes, ways) for network in (held, wanted))
+    seen = torch.tensor([new.index(channel) for channel in old])
+    features = torch.arange(wanted.channels)
+    if wanted.shortcut:
+        features = torch.cat((features, wanted.channels + seen))
+    every = count_features(wanted, ways)
+    places = {  # of each input that there was, in each layer that looks at planes
+        "cnns.convolutions.0.weight": (seen, len(new)),
+        "mlp.scores.weight": (features, every),
+        "mlp.1.weight": (torch.cat((features, every + features)), 2 * every),
+    }
+    widened = dict(weights)
+    for name in widened.keys() & places.keys():
+        (place, count), weight = places[name], weights[name]
+        widened[name] = weight.new_zeros(weight.shape[0], count, *weight.shape[2:])
+        widened[name][:, place.to(weight.device)] = weight
+    return widened
 
 
 def initialized(layer: nn.Conv2d | nn.Linear, gain: float = math.sqrt(2)) -> nn.Module:
