@@ -46,6 +46,8 @@ def main() -> None:
     options.add_argument("--episodes", type=int, default=500)
     options.add_argument("--seed", type=int, default=5, help="of the sequences")
     options.add_argument("--threads", type=int, default=2)
+    options.add_argument("--symmetric", action="store_true",
+                         help="ask the agents in all symmetries of the bin")  # fmt: skip
     chosen = options.parse_args()
     torch.set_num_threads(chosen.threads)
     found = checkpoint.read(chosen.checkpoint)
@@ -74,8 +76,8 @@ def main() -> None:
     table = []
     for text in ("", *chosen.plans):
         policy = (
-            make_planner(found, Plan.parse(text), stream) if text
-            else checkpoint.load_policy(found, "cpu", 0)
+            make_planner(found, Plan.parse(text), stream, symmetric=chosen.symmetric) if text
+            else checkpoint.load_policy(found, symmetric=chosen.symmetric)
         )  # fmt: skip
         played = play(policy, game, chosen.episodes)
         reached = played.utilization

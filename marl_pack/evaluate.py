@@ -292,6 +292,9 @@ def parser() -> argparse.ArgumentParser:
     add("--plan", metavar="rollouts=K,top=M",
         help="learned agents try their M best pairs in K imagined futures before each placement; "
              "depth=D ends each future after D items by the critic's word")  # fmt: skip
+    add("--symmetric", action="store_true",
+        help="ask learned agents in all symmetries of the bin and take what is most probable in "
+             "the mean")  # fmt: skip
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
         help="bin size in cells; a file brings its own")  # fmt: skip
@@ -340,21 +343,24 @@ def choose_policies(
     if (pair[0] is None) != (pair[1] is None):
         raise ValueError("--orientation and --placement go together: name both agents")
     names = arguments.policy or ([] if pair[0] else ["dblf"])
+    sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
+    if arguments.symmetric and all(name in ORIENTATION_AGENTS for name in sources):
+        raise ValueError("--symmetric goes with a run's folder or checkpoint")
     if all(name in POLICIES for name in names) and pair == (None, None):
         return {n: make_policy(n, arguments.seed, arguments.device) for n in names}, {}
     # Only learned agents need rsl_rl.
     from marl_pack.agents import checkpoint
 
-    where = arguments.device, arguments.seed
-    policies = {name: checkpoint.find_policy(name, *where) for name in names}
+    how = arguments.device, arguments.seed, arguments.symmetric
+    policies = {name: checkpoint.find_policy(name, *how) for name in names}
     if pair[0] is not None:
         policies[f"{pair[0]} + {pair[1]}"] = in_turns(
-            checkpoint.find_orientation_agent(pair[0], *where),
-            checkpoint.find_placement_agent(pair[1], *where),
+            checkpoint.find_orientation_agent(pair[0], *how),
+            checkpoint.find_placement_agent(pair[1], *how),
         )
     learned: dict[str, Any] = {}
-    for source in dict.fromkeys((*names, *pair)):
-        if source is not None and source not in ORIENTATION_AGENTS:
+    for source in sources:
+        if source not in ORIENTATION_AGENTS:
             found = checkpoint.read(source)
             learned = learned or found["config"]["game"]
             console.print(f"{source}: trained on {checkpoint.trained_on(found)}", soft_wrap=True)
@@ -394,7 +400,7 @@ def with_plans(
                 learned = stream
             futures = independent(learned).to(arguments.device)
             planned[f"{name}, {plan}"] = make_planner(
-                found, plan, futures, arguments.device, arguments.seed
+                found, plan, futures, arguments.device, arguments.seed, arguments.symmetric
             )
     return planned
 
@@ -498,6 +504,8 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         title += ", no mask of orientations"
     if any(arguments.com_offset):
         title += f", centre of mass off by {' '.join(f'{o:g}' for o in arguments.com_offset)}"
+    if arguments.symmetric:
+        title += "; agents asked in all symmetries"
     if bodies is not None and str(bodies):
         title += f"; {bodies}"
     show(rows, title, console)

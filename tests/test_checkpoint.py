@@ -26,9 +26,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_policy_is_rebuilt_from_its_file_on_any_bin(runs: Path) -> None:
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_policy_is_rebuilt_from_its_file_on_any_bin(runs: Path, symmetric: bool) -> None:
     for name in ("both", "joint", "frozen"):
-        policy = checkpoint.find_policy(str(runs / name))
+        policy = checkpoint.find_policy(str(runs / name), symmetric=symmetric)
         game = Packing(16, (12, 9, 11), auto_reset=False)
         for _ in range(5):
             game.place(*policy(game))  # raises if a choice is not legal

@@ -4,11 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from marl_pack import config
 from marl_pack.agents import checkpoint
+from marl_pack.agents.heuristics import make_policy
 from marl_pack.evaluate import main
+from marl_pack.packing import Packing
 
 MODELS = sorted((Path(__file__).parent.parent / "models").glob("*.pt"))
 
@@ -28,6 +31,26 @@ def test_a_model_plays_the_game_it_was_trained_on(
     assert f"{path}: trained on" in capsys.readouterr().out
 
 
+def test_asked_in_all_symmetries_a_model_plays_the_mirrored_bin_alike() -> None:
+    game = Packing(64, seed=3)
+    for _ in range(4):
+        game.place(*make_policy("random", 2)(game))
+    mirrored = game.branch(torch.arange(game.n))
+    for maps in ("heightmap", "empty_map"):
+        getattr(mirrored.bins, maps).copy_(getattr(game.bins, maps).flip(1))
+    mirrored.mask = mirrored.masks(mirrored.bins, mirrored.items, mirrored.weights)
+
+    def alike(symmetric: bool) -> float:
+        policy = checkpoint.find_policy(str(MODELS[-1]), symmetric=symmetric)
+        (way, cell), (other_way, other_cell) = policy(game), policy(mirrored)
+        x = 10 - game.orient(way).sides[:, 0].long() - cell // 10
+        same = (way == other_way) & (x * 10 + cell % 10 == other_cell)
+        return float(same.float().mean())
+
+    assert alike(symmetric=False) < 0.9
+    assert alike(symmetric=True) > 0.95  # but for ties
+
+
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
 def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> None:
     found = checkpoint.read(path)
@@ -37,3 +60,14 @@ def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> N
     curve = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", names=True)
     assert curve["items"][-1] >= found["items"]
     assert f"## {path.stem}\n" in (path.parent / "README.md").read_text(encoding="utf-8")
+
+
+def test_only_learned_agents_are_asked_in_all_symmetries(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["--policy", "dblf", "--symmetric", "--episodes", "2"])
+    assert "--symmetric goes with" in capsys.readouterr().err
+    command = ["--policy", str(MODELS[-1]), "dblf", "--symmetric", "--episodes", "2"]
+    assert main(command) == 0
+    assert main([*command, "--plan", "rollouts=1,top=2,depth=1"]) == 0

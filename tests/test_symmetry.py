@@ -6,8 +6,9 @@ from torch import Tensor
 
 from marl_pack.agents import joint, orientation, placement
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.symmetry import transform
-from marl_pack.agents.trunk import PLANES
+from marl_pack.agents.model import make_actor
+from marl_pack.agents.symmetry import carry, mean_probabilities, see, transform
+from marl_pack.agents.trunk import PLANES, Network
 from marl_pack.packing import Packing
 
 SIZE = (6, 6, 8)
@@ -86,3 +87,31 @@ def test_a_bin_that_is_not_square_is_mirrored() -> None:
         torch.full((game.n,), 3),
     )
     assert all(torch.equal(twice[name], seen[name]) for name in seen)
+
+
+@pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
+def test_the_mean_over_the_symmetries_is_the_same_in_the_mirrored_bin(agent: str) -> None:
+    torch.manual_seed(4)
+    actor = make_actor(agent, vars(Network(channels=8, planes=list(PLANES))), "cpu")
+    with torch.no_grad():  # else the heads begin with nearly even odds
+        for weight in actor.mlp.parameters():
+            weight.normal_()
+    game = played(SIZE)
+    chosen, _ = make_policy("random", 3)(game)
+    if agent == "orientation":
+        seen = orientation.observe(game, PLANES)
+    elif agent == "placement":
+        seen = placement.observe(game, PLANES, chosen)
+    else:
+        seen = joint.observe(game, PLANES)
+    here = mean_probabilities(actor, seen, agent)
+    assert torch.allclose(here.sum(1), torch.ones(game.n))
+    assert (here[~seen["mask"]] == 0).all()
+    actor(seen, stochastic_output=True)
+    assert not torch.allclose(here, actor.output_distribution_params[0].exp(), atol=0.01)
+    actions = torch.arange(here.shape[1]).expand(game.n, -1)
+    for symmetry in range(8):
+        kinds = torch.full((game.n,), symmetry)
+        there = mean_probabilities(actor, see(seen, agent, kinds), agent)
+        moved = carry(actions, seen["item"], SIZE[:2], agent, kinds)
+        assert torch.allclose(there.gather(1, moved)[seen["mask"]], here[seen["mask"]], atol=1e-5)

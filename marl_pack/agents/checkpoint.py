@@ -37,6 +37,7 @@ from marl_pack.agents.policy import (
     Policy,
     in_turns,
 )
+from marl_pack.agents.symmetry import mean_probabilities
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.files import write_atomically
 from marl_pack.packing import Packing
@@ -141,37 +142,50 @@ def load_critic(
     return critic.eval()
 
 
-def _best(actor: Actor, seen: Mapping[str, Tensor]) -> Tensor:
+def _best(actor: Actor, agent: str, seen: Mapping[str, Tensor], symmetric: bool) -> Tensor:
     """The most probable action, int64 [N]."""
     with torch.inference_mode():
+        if symmetric:
+            return mean_probabilities(actor, seen, agent).argmax(1)
         return actor(seen).squeeze(1).long()
 
 
-def learned_orientation_agent(actor: Actor) -> OrientationAgent:
-    """A network as the first agent; takes the most probable orientation."""
+def learned_orientation_agent(actor: Actor, symmetric: bool = False) -> OrientationAgent:
+    """A network as the first agent; takes the most probable orientation.
+
+    Args:
+        actor: the network.
+        symmetric: whether it is asked in all symmetries of the bin
+            (:func:`marl_pack.agents.symmetry.mean_probabilities`).
+    """
     planes = actor.cnns.planes
-    return lambda game: _best(actor, orientation.observe(game, planes))
+    return lambda game: _best(actor, "orientation", orientation.observe(game, planes), symmetric)
 
 
-def learned_placement_agent(actor: Actor) -> PlacementAgent:
-    """A network as the second agent; takes the most probable cell."""
+def learned_placement_agent(actor: Actor, symmetric: bool = False) -> PlacementAgent:
+    """A network as the second agent; takes the most probable cell. Arguments as above."""
     planes = actor.cnns.planes
-    return lambda game, chosen: _best(actor, placement.observe(game, planes, chosen))
+    return lambda game, chosen: _best(
+        actor, "placement", placement.observe(game, planes, chosen), symmetric
+    )
 
 
-def learned_joint_policy(actor: Actor) -> Policy:
-    """The joint agent's network; takes the most probable pair."""
+def learned_joint_policy(actor: Actor, symmetric: bool = False) -> Policy:
+    """The joint agent's network; takes the most probable pair. Arguments as above."""
     planes = actor.cnns.planes
 
     def play(game: Packing) -> Choice:
         cells = game.size[0] * game.size[1]
-        return joint.split(_best(actor, joint.observe(game, planes)), cells)
+        return joint.split(_best(actor, "joint", joint.observe(game, planes), symmetric), cells)
 
     return play
 
 
 def load_policy(
-    found: Mapping[str, Any], device: torch.device | str = "cpu", seed: int | None = 0
+    found: Mapping[str, Any],
+    device: torch.device | str = "cpu",
+    seed: int | None = 0,
+    symmetric: bool = False,
 ) -> Policy:
     """The whole policy of a checkpoint, frozen agents included.
 
@@ -179,36 +193,49 @@ def load_policy(
         found: what :func:`read` gave.
         device: of the games.
         seed: of a frozen agent that plays at random; None draws from torch's global generator.
+        symmetric: whether learned agents are asked in all symmetries of the bin.
     """
+    how = device, seed, symmetric
     if "joint" in found["agents"]:
-        return learned_joint_policy(load_actor(found, "joint", device))
-    return in_turns(orientation_agent(found, device, seed), placement_agent(found, device, seed))
+        return learned_joint_policy(load_actor(found, "joint", device), symmetric)
+    return in_turns(orientation_agent(found, *how), placement_agent(found, *how))
 
 
 def orientation_agent(
-    found: Mapping[str, Any], device: torch.device | str, seed: int | None = 0
+    found: Mapping[str, Any],
+    device: torch.device | str,
+    seed: int | None = 0,
+    symmetric: bool = False,
 ) -> OrientationAgent:
     """The first agent of a checkpoint (of its ``agents`` alone, too). Arguments as above."""
     if "joint" in found["agents"]:
-        policy = learned_joint_policy(load_actor(found, "joint", device))
+        policy = learned_joint_policy(load_actor(found, "joint", device), symmetric)
         return lambda game: policy(game)[0]
     rule = found["agents"].get("orientation", {}).get("name")
     if rule is not None:
         return make_orientation_agent(rule, seed, device)
-    return learned_orientation_agent(load_actor(found, "orientation", device))
+    return learned_orientation_agent(load_actor(found, "orientation", device), symmetric)
 
 
 def placement_agent(
-    found: Mapping[str, Any], device: torch.device | str, seed: int | None = 0
+    found: Mapping[str, Any],
+    device: torch.device | str,
+    seed: int | None = 0,
+    symmetric: bool = False,
 ) -> PlacementAgent:
     """The second agent of a checkpoint (of its ``agents`` alone, too). Arguments as above."""
     rule = found["agents"].get("placement", {}).get("name")
     if rule is not None:
         return make_placement_agent(rule, seed, device)
-    return learned_placement_agent(load_actor(found, "placement", device))
+    return learned_placement_agent(load_actor(found, "placement", device), symmetric)
 
 
-def find_policy(source: str, device: torch.device | str = "cpu", seed: int | None = 0) -> Policy:
+def find_policy(
+    source: str,
+    device: torch.device | str = "cpu",
+    seed: int | None = 0,
+    symmetric: bool = False,
+) -> Policy:
     """The policy that ``source`` names: one of :data:`POLICIES`, a run's folder or a checkpoint.
 
     Raises:
@@ -216,25 +243,32 @@ def find_policy(source: str, device: torch.device | str = "cpu", seed: int | Non
     """
     if source in POLICIES:
         return make_policy(source, seed, device)
-    return load_policy(read(_path(source, POLICIES), device), device, seed)
+    return load_policy(read(_path(source, POLICIES), device), device, seed, symmetric)
 
 
 def find_orientation_agent(
-    source: str, device: torch.device | str = "cpu", seed: int | None = 0
+    source: str,
+    device: torch.device | str = "cpu",
+    seed: int | None = 0,
+    symmetric: bool = False,
 ) -> OrientationAgent:
     """The first agent: one of :data:`ORIENTATION_AGENTS`, or a checkpoint's."""
     if source in ORIENTATION_AGENTS:
         return make_orientation_agent(source, seed, device)
-    return orientation_agent(read(_path(source, ORIENTATION_AGENTS), device), device, seed)
+    found = read(_path(source, ORIENTATION_AGENTS), device)
+    return orientation_agent(found, device, seed, symmetric)
 
 
 def find_placement_agent(
-    source: str, device: torch.device | str = "cpu", seed: int | None = 0
+    source: str,
+    device: torch.device | str = "cpu",
+    seed: int | None = 0,
+    symmetric: bool = False,
 ) -> PlacementAgent:
     """The second agent: one of :data:`POLICIES`, or a checkpoint's."""
     if source in POLICIES:
         return make_placement_agent(source, seed, device)
-    return placement_agent(read(_path(source, POLICIES), device), device, seed)
+    return placement_agent(read(_path(source, POLICIES), device), device, seed, symmetric)
 
 
 def trained_on(found: Mapping[str, Any]) -> str:

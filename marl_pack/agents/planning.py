@@ -23,6 +23,7 @@ from marl_pack.agents import orientation, placement
 from marl_pack.agents.checkpoint import load_actor, load_critic
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import Choice
+from marl_pack.agents.symmetry import mean_probabilities
 from marl_pack.bins import ORIENTATIONS, oriented
 from marl_pack.items import Stream
 from marl_pack.packing import Packing
@@ -88,6 +89,7 @@ class Planner:
         plan: how far to look.
         futures: what may come, e.g. ``make_stream("rs", …)``; drawn anew for every decision.
         seed: of the futures.
+        symmetric: whether the agents are asked in all symmetries of the bin which pairs are best.
     """
 
     def __init__(
@@ -98,11 +100,13 @@ class Planner:
         plan: Plan,
         futures: Stream,
         seed: int = 0,
+        symmetric: bool = False,
     ) -> None:
         if plan.depth is not None and critic is None:
             raise ValueError("plan: a depth needs the orientation agent's critic")
         self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
         self.critic, self.plan, self.futures = critic, plan, futures
+        self.symmetric = symmetric
         self.seed = -1 - seed  # games have seeds from 0: what really comes is never foreseen
 
     @torch.inference_mode()
@@ -170,20 +174,18 @@ class Planner:
         probable = [torch.zeros(0, ways, cells, dtype=torch.float64, device=game.device)]
         for some in torch.split(which, max(1, AT_ONCE // (ways * cells))):
             each = game.branch(some)
-            first = self._log_probs(
-                self.orientation_agent,
-                orientation.observe(each, self.orientation_agent.cnns.planes),
+            first = self._probabilities(
+                "orientation", orientation.observe(each, self.orientation_agent.cnns.planes)
             )  # [b, 6]
-            second = self._log_probs(
-                self.placement_agent,
+            second = self._probabilities(
+                "placement",
                 placement.observe(
                     each.branch(torch.arange(len(some)).repeat_interleave(ways)),
                     self.placement_agent.cnns.planes,
                     every.repeat(len(some)),
                 ),
             )  # [b · 6, W · D]
-            both = first[:, :, None] + second.view(-1, ways, cells)
-            probable.append(both.double().exp())
+            probable.append(first[:, :, None] * second.view(-1, ways, cells))
         legal = game.mask[which].flatten(2)
         same = _twins(game)[which].double()
         both = torch.einsum("noe,nec->noc", same, torch.cat(probable) * legal)
@@ -192,11 +194,13 @@ class Planner:
         found, pairs = both.topk(min(self.plan.top, both.shape[1]))
         return pairs, found >= 0
 
-    @staticmethod
-    def _log_probs(actor: Actor, seen: Mapping[str, Tensor]) -> Tensor:
-        """Of all actions, [B, K]."""
+    def _probabilities(self, agent: str, seen: Mapping[str, Tensor]) -> Tensor:
+        """Of all actions of ``orientation`` or ``placement``, float64 [B, K]."""
+        actor = self.orientation_agent if agent == "orientation" else self.placement_agent
+        if self.symmetric:
+            return mean_probabilities(actor, seen, agent).double()
         actor(seen, stochastic_output=True)
-        return actor.output_distribution_params[0]
+        return actor.output_distribution_params[0].double().exp()
 
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
         """What share of each bin is full in the end [N].
@@ -244,12 +248,13 @@ def make_planner(
     futures: Stream,
     device: torch.device | str = "cpu",
     seed: int = 0,
+    symmetric: bool = False,
 ) -> Planner:
     """Plan with the agents of a checkpoint.
 
     Args:
         found: what :func:`marl_pack.agents.checkpoint.read` gave.
-        plan, futures, seed: as for :class:`Planner`.
+        plan, futures, seed, symmetric: as for :class:`Planner`.
         device: of the games.
 
     Raises:
@@ -265,4 +270,4 @@ def make_planner(
                 f"critic speaks of shares of the bin, not {alpha:g} and {gamma:g}"
             )
         critic = load_critic(found, "orientation", device, first)
-    return Planner(first, second, critic, plan, futures, seed)
+    return Planner(first, second, critic, plan, futures, seed, symmetric)

@@ -1,4 +1,4 @@
-"""The bin's symmetries, as augmentation of what PPO learns from.
+"""The bin's symmetries: augmentation of what PPO learns from, and agents asked in all of them.
 
 Mirroring the bin along x or y and, where W = D, exchanging x and y change nothing in the game: a
 box set down in the mirrored bin stands as it did. Masks and planes lie at the window's low corner,
@@ -7,12 +7,14 @@ which moves with the item's sides; exchanging x and y also exchanges orientation
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
 from torch import Tensor
 
+from marl_pack.agents.model import Actor
 from marl_pack.bins import oriented
 
 MAPS = (
@@ -22,6 +24,35 @@ MAPS = (
     "room",
     "fits",
 )  # observations [B, A, W, D] that lie at low corners
+
+
+def count(width: int, depth: int) -> int:
+    """How many symmetries a W × D bin has, the one that changes nothing included."""
+    return 8 if width == depth else 4
+
+
+def mean_probabilities(actor: Actor, observation: Mapping[str, Tensor], agent: str) -> Tensor:
+    """How probable each action is in the mean over the bin's symmetries, float32 [N, K].
+
+    The actor judges the same decision as often as the bin has symmetries, and its errors partly
+    cancel.
+
+    Args:
+        actor: the agent's network.
+        observation: of the agent, as its ``observe`` gives it.
+        agent: ``orientation``, ``placement`` or ``joint``.
+    """
+    mask, item = observation["mask"], observation["item"]
+    shape = observation["heightmap"].shape[1:]
+    actions = torch.arange(mask.shape[1], device=mask.device).expand(len(mask), -1)
+    total = torch.zeros(mask.shape, device=mask.device)
+    kinds = count(*shape)
+    for kind in range(kinds):
+        symmetry = torch.full((len(mask),), kind, device=mask.device)
+        actor(see(observation, agent, symmetry), stochastic_output=True)
+        log_probs = actor.output_distribution_params[0]
+        total += log_probs.exp().gather(1, carry(actions, item, shape, agent, symmetry))
+    return total / kinds
 
 
 def see_through_symmetries(ppo: PPO, agent: str) -> None:
@@ -39,8 +70,9 @@ def see_through_symmetries(ppo: PPO, agent: str) -> None:
         for step in range(storage.num_transitions_per_env):
             seen = storage.observations[step]
             width, depth = seen["heightmap"].shape[1:]
-            kinds = 8 if width == depth else 4
-            symmetry = torch.randint(kinds, (storage.num_envs,), device=storage.device)
+            symmetry = torch.randint(
+                count(width, depth), (storage.num_envs,), device=storage.device
+            )
             moved, actions = transform(seen, storage.actions[step], agent, symmetry)
             seen.copy_(moved)
             storage.actions[step].copy_(actions)
@@ -54,8 +86,8 @@ def see_through_symmetries(ppo: PPO, agent: str) -> None:
 
 
 def transform(
-    observation: dict[str, Tensor], actions: Tensor, agent: str, symmetry: Tensor
-) -> tuple[dict[str, Tensor], Tensor]:
+    observation: Mapping[str, Tensor], actions: Tensor, agent: str, symmetry: Tensor
+) -> tuple[Any, Tensor]:
     """Observations and actions of B bins after each one's symmetry.
 
     Args:
@@ -67,7 +99,29 @@ def transform(
     Returns:
         The same groups and the actions that set the items down in the same, now mirrored, places.
     """
-    flip_x, flip_y, swap = ((symmetry >> bit & 1).bool() for bit in range(3))
+    shape = observation["heightmap"].shape[1:]
+    moved = carry(actions.long(), observation["item"], shape, agent, symmetry)
+    return see(observation, agent, symmetry), moved.to(actions.dtype)
+
+
+def _exchanged(swap: Tensor, a: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """(a, c), or (c, a) in the bins that are exchanged."""
+    wide = swap.view(-1, *[1] * (a.dim() - 1))
+    return torch.where(wide, c, a), torch.where(wide, a, c)
+
+
+def _mirrored(low: Tensor, side: Tensor | int, length: int, flip: Tensor) -> Tensor:
+    """Where low corners lie in a mirrored bin; positions that never fit stay in range."""
+    return torch.where(flip, (length - side - low) % length, low)
+
+
+def _bits(symmetry: Tensor) -> Iterator[Tensor]:
+    return ((symmetry >> bit & 1).bool() for bit in range(3))
+
+
+def see(observation: Mapping[str, Tensor], agent: str, symmetry: Tensor) -> Any:
+    """The observations of :func:`transform`."""
+    flip_x, flip_y, swap = _bits(symmetry)
     heightmap, item = observation["heightmap"], observation["item"]
     size, (width, depth) = len(heightmap), heightmap.shape[1:]
     device = heightmap.device
@@ -76,26 +130,18 @@ def transform(
     ways = 1 if agent == "placement" else 6
     sides = item[:, None] if agent == "placement" else oriented(item)  # [B, A, 3]
 
-    def mirrored(low: Tensor, side: Tensor, length: int, flip: Tensor) -> Tensor:
-        """Where low corners lie in a mirrored bin; positions that never fit stay in range."""
-        return torch.where(flip, (length - side - low) % length, low)
-
-    def exchanged(a: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """(a, c), or (c, a) in the bins that are exchanged."""
-        wide = swap.view(-1, *[1] * (a.dim() - 1))
-        return torch.where(wide, c, a), torch.where(wide, a, c)
-
     # The maps are read backwards: the new map's cell (x, y) shows an old one's. Undo the exchange
     # first, then the mirrors.
     seen = dict(observation.items())
-    from_x, from_y = exchanged(
-        x[None, :, None].expand(size, width, depth), y[None, None, :].expand(size, width, depth)
+    from_x, from_y = _exchanged(
+        swap,
+        x[None, :, None].expand(size, width, depth),
+        y[None, None, :].expand(size, width, depth),
     )
-    one = torch.ones((), dtype=torch.int64, device=device)
     old_cell = (
         b[:, None, None],
-        mirrored(from_x, one, width, flip_x[:, None, None]),
-        mirrored(from_y, one, depth, flip_y[:, None, None]),
+        _mirrored(from_x, 1, width, flip_x[:, None, None]),
+        _mirrored(from_y, 1, depth, flip_y[:, None, None]),
     )
     for name in ("heightmap", "solid"):
         if name in seen:
@@ -104,8 +150,9 @@ def transform(
     if ways > 1:
         way = torch.where(swap[:, None], way ^ 1, way)
     side = sides.long().gather(1, way[..., None].expand(-1, -1, 3))  # of the old orientation
-    old_x = mirrored(from_x[:, None], side[..., 0, None, None], width, flip_x[:, None, None, None])
-    old_y = mirrored(from_y[:, None], side[..., 1, None, None], depth, flip_y[:, None, None, None])
+    wide_x, wide_y = (flip[:, None, None, None] for flip in (flip_x, flip_y))
+    old_x = _mirrored(from_x[:, None], side[..., 0, None, None], width, wide_x)
+    old_y = _mirrored(from_y[:, None], side[..., 1, None, None], depth, wide_y)
 
     def maps(values: Tensor) -> Tensor:
         return values[b[:, None, None, None], way[..., None, None], old_x, old_y]
@@ -120,22 +167,28 @@ def transform(
     if agent == "placement":
         turned = torch.stack((item[:, 1], item[:, 0], item[:, 2]), 1)
         seen["item"] = torch.where(swap[:, None], turned, item)
+    return _like(observation, seen)
 
-    # The actions are carried forwards: mirrors first, then the exchange.
-    action = actions.long().squeeze(-1)
-    cells = width * depth
+
+def carry(
+    actions: Tensor, item: Tensor, shape: Sequence[int], agent: str, symmetry: Tensor
+) -> Tensor:
+    """The actions of :func:`transform`, any number of each bin's, int64 [B, K]."""
+    # Actions are carried forwards: mirrors first, then the exchange.
+    flip_x, flip_y, swap = (bit[:, None] for bit in _bits(symmetry))
     if agent == "orientation":
-        moved = torch.where(swap, action ^ 1, action)
-    else:
-        chosen, cell = action // cells, action % cells
-        own = sides.long()[b, chosen]
-        new_x, new_y = exchanged(
-            mirrored(cell // depth, own[:, 0], width, flip_x),
-            mirrored(cell % depth, own[:, 1], depth, flip_y),
-        )
-        chosen = torch.where(swap, chosen ^ 1, chosen) if agent == "joint" else chosen
-        moved = chosen * cells + new_x * depth + new_y
-    return _like(observation, seen), moved[:, None].to(actions.dtype)
+        return torch.where(swap, actions ^ 1, actions)
+    width, depth = shape
+    chosen, cell = actions // (width * depth), actions % (width * depth)
+    sides = item[:, None] if agent == "placement" else oriented(item)  # [B, A, 3]
+    own = sides.long().gather(1, chosen[..., None].expand(-1, -1, 3))
+    new_x, new_y = _exchanged(
+        swap.squeeze(1),
+        _mirrored(cell // depth, own[..., 0], width, flip_x),
+        _mirrored(cell % depth, own[..., 1], depth, flip_y),
+    )
+    chosen = torch.where(swap, chosen ^ 1, chosen) if agent == "joint" else chosen
+    return chosen * width * depth + new_x * depth + new_y
 
 
 def _like(original: Any, seen: dict[str, Tensor]) -> Any:
