@@ -25,35 +25,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from scipy import stats
 
-from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
-from marl_pack.agents.policy import Policy, in_turns
-from marl_pack.bins import Size, check_device
+from marl_pack.agents.policy import Policy
+from marl_pack.bins import Size
 from marl_pack.files import check_writable, write_atomically, write_json
-from marl_pack.items import (
-    DEFAULT_SIDES,
-    GENERATED,
-    Stream,
-    choose_stream,
-    independent,
-    make_stream,
-)
-from marl_pack.packing import ALL_ORIENTATIONS, Packing
+from marl_pack.options import EPILOG, add_options, choose
+from marl_pack.packing import Packing
 from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
 from marl_pack.sapien_check.packings import Bodies
-from marl_pack.stability import RULES, in_equilibrium
-from marl_pack.stability.candidates import NO_OFFSET
+from marl_pack.stability import in_equilibrium
 
 BATCH = 1024  # bins played at once, at most
 BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
 NOT_STACKS = "not a file of stacks from evaluate --save-stacks"
 EPISODES = 1000  # of a generated stream, unless told
-DEFAULTS: dict[str, Any] = {
-    "items": "rs", "bin": None, "sides": DEFAULT_SIDES, "rule": "hull_alpha", "margin": None,
-    "thresholds": None, "orientations": list(ALL_ORIENTATIONS), "mask_orientations": True,
-    "com_offset": NO_OFFSET,
-}  # fmt: skip
-"""The game's options where neither the command line nor a checkpoint says; ``bin`` None is the
-file's own or 10 x 10 x 10."""
 
 
 @dataclass(frozen=True)
@@ -276,49 +260,11 @@ def parser() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(
         prog="python -m marl_pack.evaluate",
         description=__doc__.split("\n\n")[0],
-        epilog="The game is the one that the first checkpoint among the policies was trained on, "
-        "else RS in a bin of 10 x 10 x 10 under hull_alpha; each option changes that.",
+        epilog=EPILOG,
     )
+    add_options(options)
     add = options.add_argument
-    add("--policy", nargs="+", metavar="NAME",
-        help=f"one or more of {', '.join(POLICIES)}, runs' folders or checkpoints "
-             "(default: dblf)")  # fmt: skip
-    add("--orientation", metavar="NAME",
-        help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, a "
-             "run's folder or a checkpoint")  # fmt: skip
-    add("--placement", metavar="NAME",
-        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a run's "
-             "folder or a checkpoint")  # fmt: skip
-    add("--plan", metavar="rollouts=K,top=M",
-        help="learned agents try their M best pairs in K imagined futures before each placement; "
-             "depth=D ends each future after D items by the critic's word")  # fmt: skip
-    add("--symmetric", action="store_true",
-        help="ask learned agents in all symmetries of the bin and take what is most probable in "
-             "the mean")  # fmt: skip
-    add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
-    add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
-        help="bin size in cells; a file brings its own")  # fmt: skip
-    add("--sides", nargs=2, type=int, metavar=("SHORTEST", "LONGEST"),
-        help="sides of generated items, in cells")  # fmt: skip
-    add("--rule", choices=list(RULES), help="stability rule of the masks")
-    add("--margin", type=float, help="cells by which the support polygon is shrunk")
-    add("--thresholds", choices=["paper", "code"], help="of the rule area_ratio")
-    add("--orientations", nargs="+", type=int, metavar="O",
-        help="orientations that may be chosen, of 0 … 5")  # fmt: skip
-    add("--orientation-mask", action=argparse.BooleanOptionalAction, dest="mask_orientations",
-        help="whether orientations without a legal cell are excluded; else choosing one ends the "
-             "episode")  # fmt: skip
-    add("--com-offset", nargs=3, type=float, metavar=("X", "Y", "Z"),
-        help="centre of mass of the items from their middle, in fractions of w, d, h")  # fmt: skip
     add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
-    add(
-        "--seed",
-        type=int,
-        default=0,
-        help="of generated items, random play and drawn bodies (default: 0)",
-    )
-    add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
-    add("--threads", type=int, default=1, help="on the CPU (default: 1)")
     add("--physics", action="store_true",
         help="judge every packing in SAPIEN after each placement: the column falls")  # fmt: skip
     Bodies.add_options(options)
@@ -328,112 +274,14 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
-def choose_policies(
-    arguments: argparse.Namespace, console: Console
-) -> tuple[dict[str, Policy], dict[str, Any]]:
-    """The policies that the options name, by the name of their row, and the game they are for.
-
-    The game is that of the first checkpoint among them (the keys of
-    :class:`marl_pack.config.Game`), empty if there is none.
-
-    Raises:
-        ValueError, FileNotFoundError: if there is none of that name.
-    """
-    pair = arguments.orientation, arguments.placement
-    if (pair[0] is None) != (pair[1] is None):
-        raise ValueError("--orientation and --placement go together: name both agents")
-    names = arguments.policy or ([] if pair[0] else ["dblf"])
-    sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
-    if arguments.symmetric and all(name in ORIENTATION_AGENTS for name in sources):
-        raise ValueError("--symmetric goes with a run's folder or checkpoint")
-    if all(name in POLICIES for name in names) and pair == (None, None):
-        return {n: make_policy(n, arguments.seed, arguments.device) for n in names}, {}
-    # Only learned agents need rsl_rl.
-    from marl_pack.agents import checkpoint
-
-    how = arguments.device, arguments.seed, arguments.symmetric
-    policies = {name: checkpoint.find_policy(name, *how) for name in names}
-    if pair[0] is not None:
-        policies[f"{pair[0]} + {pair[1]}"] = in_turns(
-            checkpoint.find_orientation_agent(pair[0], *how),
-            checkpoint.find_placement_agent(pair[1], *how),
-        )
-    learned: dict[str, Any] = {}
-    for source in sources:
-        if source not in ORIENTATION_AGENTS:
-            found = checkpoint.read(source)
-            learned = learned or found["config"]["game"]
-            console.print(f"{source}: trained on {checkpoint.trained_on(found)}", soft_wrap=True)
-    return policies, learned
-
-
-def with_plans(
-    policies: dict[str, Policy], arguments: argparse.Namespace, stream: Stream, size: Size
-) -> dict[str, Policy]:
-    """The learned policies, planning as ``--plan`` says; heuristics stay as they are.
-
-    What they imagine to come is what they were trained on; if that was a file, the rows of
-    ``stream``.
-
-    Raises:
-        ValueError: if the plan cannot be read, or there is no checkpoint to plan with.
-    """
-    from marl_pack.agents import checkpoint
-    from marl_pack.agents.planning import Plan, make_planner
-
-    plan = Plan.parse(arguments.plan)
-    if all(name in POLICIES for name in policies) or arguments.orientation is not None:
-        raise ValueError("--plan goes with --policy and a run's folder or checkpoint")
-    planned: dict[str, Policy] = {}
-    for name, policy in policies.items():
-        if name in POLICIES:
-            planned[name] = policy
-        else:
-            found = checkpoint.read(name, arguments.device)
-            game = found["config"]["game"]
-            if game["items"] in GENERATED:
-                try:
-                    learned = make_stream(game["items"], size, tuple(game["sides"]))
-                except ValueError as error:
-                    raise ValueError(f"--plan: what the agents were trained on: {error}") from None
-            else:
-                learned = stream
-            futures = independent(learned).to(arguments.device)
-            planned[f"{name}, {plan}"] = make_planner(
-                found, plan, futures, arguments.device, arguments.seed, arguments.symmetric
-            )
-    return planned
-
-
-def choose_game(arguments: argparse.Namespace, learned: dict[str, Any]) -> None:
-    """Fill the options on the game that were not given.
-
-    Args:
-        arguments: the options, changed in place.
-        learned: the game that the policies were trained on, empty if there is none.
-    """
-    settings = DEFAULTS | learned
-    if arguments.rule is not None:  # these belong to the rule
-        settings |= {"margin": None, "thresholds": None}
-    if arguments.items is not None and arguments.items not in GENERATED:
-        settings["bin"] = None
-    for key in DEFAULTS:
-        if getattr(arguments, key) is None:
-            setattr(arguments, key, settings[key])
-
-
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
     """Play what the options ask for; a row of figures for each policy.
 
     Raises:
         ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
     """
-    check_device(arguments.device)
-    if arguments.seed < 0:
-        raise ValueError(f"--seed {arguments.seed}: needs 0 or more")
-    policies, learned = choose_policies(arguments, console)
-    choose_game(arguments, learned)
-    if arguments.save_stacks and len(policies) > 1:
+    setup = choose(arguments, console)
+    if arguments.save_stacks and len(setup.policies) > 1:
         raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
@@ -445,38 +293,21 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         raise ValueError("--cell, --density and --com-spread go with --physics")
     if arguments.processes < 1:
         raise ValueError(f"--processes {arguments.processes}: needs 1 or more")
-    stream, size = choose_stream(
-        arguments.items, tuple(arguments.bin) if arguments.bin else None, tuple(arguments.sides)
-    )
-    if arguments.plan is not None:
-        policies = with_plans(policies, arguments, stream, size)
-    episodes = arguments.episodes
+    episodes, known = arguments.episodes, setup.stream.episodes
     if episodes is None:
-        episodes = stream.episodes or EPISODES
-    if episodes < 1 or (stream.episodes and episodes > stream.episodes):
-        most = f" … {stream.episodes}, the sequences of the file" if stream.episodes else " or more"
+        episodes = known or EPISODES
+    if episodes < 1 or (known and episodes > known):
+        most = f" … {known}, the sequences of the file" if known else " or more"
         raise ValueError(f"--episodes {episodes}: needs 1{most}")
-    named = {"margin": arguments.margin, "thresholds": arguments.thresholds}
-    parameters = {key: value for key, value in named.items() if value is not None}
-
-    def game(n: int, first_episode: int) -> Packing:
-        return Packing(
-            n, size, stream, rule=arguments.rule, rule_parameters=parameters,
-            orientations=arguments.orientations,
-            mask_orientations=arguments.mask_orientations,
-            com_offset=tuple(arguments.com_offset), device=arguments.device,
-            seed=arguments.seed, first_episode=first_episode, auto_reset=False,
-        )  # fmt: skip
-
     rows = {}
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         console=console, transient=True,
     )  # fmt: skip
     with bar:
-        for name, policy in policies.items():
+        for name, policy in setup.policies.items():
             task = bar.add_task(f"{name}: episodes", total=episodes)
-            played = play(policy, game, episodes, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # a default argument binds the task
+            played = play(policy, setup.game, episodes, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # a default argument binds the task
             task = bar.add_task(f"{name}: equilibria", total=episodes)
             stands = strict_equilibrium(played, lambda k, t=task: bar.advance(t, k))  # type: ignore[misc]  # likewise
             rows[name] = summary(played, stands)
@@ -495,23 +326,16 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
                 )  # fmt: skip
                 if rows[name]["no_verdict"]:
                     console.print(f"{name}: {rows[name]['no_verdict']} episodes without a verdict")
-    title = f"{arguments.items}, bin {' x '.join(map(str, size))}, rule {arguments.rule}"
-    if parameters:
-        title += f" ({', '.join(f'{k} {v}' for k, v in parameters.items())})"
-    if set(arguments.orientations) != set(ALL_ORIENTATIONS):
-        title += f", orientations {sorted(set(arguments.orientations))}"
-    if not arguments.mask_orientations:
-        title += ", no mask of orientations"
-    if any(arguments.com_offset):
-        title += f", centre of mass off by {' '.join(f'{o:g}' for o in arguments.com_offset)}"
-    if arguments.symmetric:
-        title += "; agents asked in all symmetries"
+    title = str(setup)
     if bodies is not None and str(bodies):
         title += f"; {bodies}"
     show(rows, title, console)
     if arguments.json:
         settings = {k: v for k, v in vars(arguments).items() if k not in ("json", "save_stacks")}
-        report = {"settings": settings | {"bin": size, "episodes": episodes}, "policies": rows}
+        report = {
+            "settings": settings | {"bin": setup.size, "episodes": episodes},
+            "policies": rows,
+        }
         write_json(arguments.json, report)
     return rows
 

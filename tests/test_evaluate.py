@@ -221,6 +221,25 @@ def test_play_shows_the_game_and_draws_it(
     text = capsys.readouterr().out
     assert "in strict equilibrium" in text
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    with pytest.raises(SystemExit):
-        play_command.main(["--picture", "bin.xyz"])
-    assert "ending .png" in capsys.readouterr().err
+    for wrong, said in (
+        (["--picture", "bin.xyz"], "ending .png"),
+        (["--policy", "dblf", "random", "--picture", str(path)], "one plays here"),
+        (["--episode", "-1", "--picture", str(path)], "needs 0"),
+    ):
+        with pytest.raises(SystemExit):
+            play_command.main(wrong)
+        assert said in capsys.readouterr().err
+
+
+def test_play_shows_where_a_choice_without_a_cell_ends_the_game(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = tmp_path / "items.csv"
+    items.write_text("episode,w,d,h\n0,4,4,1\n0,4,1,4\n", encoding="utf-8")
+    command = ["--orientation", "first", "--placement", "dblf", "--no-orientation-mask",
+               "--items", str(items), "--bin", "4", "4", "4",
+               "--picture", str(tmp_path / "x.png")]  # fmt: skip
+    assert play_command.main(command) == 0
+    text = capsys.readouterr().out
+    assert "nowhere" in text
+    assert "1 boxes" in text

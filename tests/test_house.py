@@ -14,7 +14,7 @@ FLOORS = (
     ("stability",),
     ("packing",),
     ("env_aec", "vec_env", "agents"),
-    ("config", "evaluate", "export", "integrations", "play", "train"),
+    ("config", "evaluate", "export", "integrations", "options", "play", "train"),
 )
 
 

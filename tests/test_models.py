@@ -12,6 +12,7 @@ from marl_pack.agents import checkpoint
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.evaluate import main
 from marl_pack.packing import Packing
+from marl_pack.play import main as play
 
 MODELS = sorted((Path(__file__).parent.parent / "models").glob("*.pt"))
 
@@ -60,6 +61,14 @@ def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> N
     curve = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", names=True)
     assert curve["items"][-1] >= found["items"]
     assert f"## {path.stem}\n" in (path.parent / "README.md").read_text(encoding="utf-8")
+
+
+def test_play_shows_a_model_in_the_game_it_was_trained_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = next(path for path in MODELS if path.stem == "cut_1")
+    assert play(["--policy", str(model), "--picture", str(tmp_path / "bin.png")]) == 0
+    assert "cut1, bin 10 x 10 x 10, rule hull_alpha" in " ".join(capsys.readouterr().out.split())
 
 
 def test_only_learned_agents_are_asked_in_all_symmetries(
