@@ -7,6 +7,7 @@ a picture; prints when each run passed the levels that others reach.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ def name_of(run: Path) -> str:
     return run.stem if run.is_file() else run.name
 
 
-def draw(runs: list[Path], path: Path) -> None:
+def draw(runs: list[Path], path: Path, levels: Sequence[tuple[str, float]]) -> None:
     """Two panels, over items and over minutes, a line a run with its 95 % interval."""
     mpl.use("Agg")
     from matplotlib import pyplot as plt
@@ -47,7 +48,7 @@ def draw(runs: list[Path], path: Path) -> None:
             panel.plot(x, 100 * rows["utilization"], label=name_of(run))
             panel.fill_between(x, 100 * rows["low"], 100 * rows["high"], alpha=0.2)
     for panel, label in zip(panels, ("million items seen", "minutes on one core"), strict=True):
-        for name, level in LEVELS:
+        for name, level in levels:
             panel.axhline(level, color="grey", linewidth=0.8, linestyle="--")
             panel.annotate(f"{name} {level}", (1, level), xycoords=("axes fraction", "data"),
                            ha="right", va="bottom", fontsize=8, color="grey")  # fmt: skip
@@ -63,12 +64,15 @@ def main() -> None:
     options = argparse.ArgumentParser(prog="python -m benchmarks.learning_curve")
     options.add_argument("runs", nargs="+", type=Path, help="runs' folders, or evaluations' files")
     options.add_argument("--picture", type=Path, default=Path("docs/learning_curve.png"))
+    options.add_argument("--levels", action=argparse.BooleanOptionalAction, default=True,
+                         help="show what others reach on RS")  # fmt: skip
     chosen = options.parse_args()
-    draw(chosen.runs, chosen.picture)
+    levels = LEVELS if chosen.levels else ()
+    draw(chosen.runs, chosen.picture, levels)
     table = []
     for run in chosen.runs:
         rows = history(run)
-        for name, level in LEVELS[:-1]:
+        for name, level in levels[:-1]:
             passed = rows[100 * rows["low"] > level]
             when = ["not reached", ""]
             if len(passed):
