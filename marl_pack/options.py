@@ -67,7 +67,10 @@ class Setup:
 
     def __str__(self) -> str:
         told = self.arguments
-        text = f"{told.items}, bin {' x '.join(map(str, self.size))}, rule {told.rule}"
+        text = str(told.items)
+        if told.items in GENERATED and tuple(told.sides) != DEFAULT_SIDES:
+            text += f" {told.sides[0]}-{told.sides[1]}"
+        text += f", bin {' x '.join(map(str, self.size))}, rule {told.rule}"
         if self.rule_parameters:
             text += f" ({', '.join(f'{k} {v}' for k, v in self.rule_parameters.items())})"
         if set(told.orientations) != set(ALL_ORIENTATIONS):

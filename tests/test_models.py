@@ -66,9 +66,11 @@ def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> N
 def test_play_shows_a_model_in_the_game_it_was_trained_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = next(path for path in MODELS if path.stem == "cut_1")
-    assert play(["--policy", str(model), "--picture", str(tmp_path / "bin.png")]) == 0
-    assert "cut1, bin 10 x 10 x 10, rule hull_alpha" in " ".join(capsys.readouterr().out.split())
+    for name, game in (("cut_1", "cut1"), ("types125", "rs 1-5")):
+        model = next(path for path in MODELS if path.stem == name)
+        assert play(["--policy", str(model), "--picture", str(tmp_path / "bin.png")]) == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        assert f"plays {game}, bin 10 x 10 x 10, rule hull_alpha" in shown
 
 
 def test_only_learned_agents_are_asked_in_all_symmetries(
