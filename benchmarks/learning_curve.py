@@ -84,7 +84,11 @@ def main() -> None:
             [name_of(run), f"end: {100 * last['utilization']:.2f} ± {half:.2f} %",
              f"{last['items']:,.0f}", f"{last['seconds'] / 60:.1f}"]
         )  # fmt: skip
-    show("first evaluation clearly above", ["run", "level", "items", "minutes"], table)
+    show(
+        "first evaluations clearly above levels, and the end",
+        ["run", "level", "items", "minutes"],
+        table,
+    )
 
 
 if __name__ == "__main__":

@@ -88,7 +88,8 @@ def main() -> None:
         ])  # fmt: skip
         print(*table[-1], sep="  ", flush=True)
     show(
-        f"planning, {chosen.episodes} episodes, {chosen.threads} threads",
+        f"planning, {chosen.episodes} episodes, {chosen.threads} threads"
+        + (", all symmetries" if chosen.symmetric else ""),
         ["plan", "utilization %", "gain", "ms a decision", "ms, one bin alone"], table,
     )  # fmt: skip
 

@@ -80,7 +80,7 @@ class Setup:
         if any(told.com_offset):
             text += f", centre of mass off by {' '.join(f'{o:g}' for o in told.com_offset)}"
         if told.symmetric:
-            text += "; agents asked in all symmetries"
+            text += "; learned agents asked in all symmetries"
         return text
 
 
@@ -101,7 +101,7 @@ def add_options(options: argparse.ArgumentParser) -> None:
              "depth=D ends each future after D items by the critic's word")  # fmt: skip
     add("--symmetric", action="store_true",
         help="ask learned agents in all symmetries of the bin and take what is most probable in "
-             "the mean")  # fmt: skip
+             "the mean; with --plan which pairs to try, not in the imagined futures")  # fmt: skip
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--bin", nargs=3, type=int, metavar=("W", "D", "H"),
         help="bin size in cells; a file brings its own")  # fmt: skip
@@ -118,7 +118,8 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add("--com-offset", nargs=3, type=float, metavar=("X", "Y", "Z"),
         help="centre of mass of the items from their middle, in fractions of w, d, h")  # fmt: skip
     add("--seed", type=int, default=0,
-        help="of generated items, random play and drawn bodies (default: 0)")  # fmt: skip
+        help="of generated items, random play, futures of --plan and drawn bodies "
+             "(default: 0)")  # fmt: skip
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     add("--threads", type=int, default=1, help="on the CPU (default: 1)")
 

@@ -51,7 +51,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     ((name, policy),) = setup.policies.items()
     known = setup.stream.episodes
     if chosen.episode < 0 or (known and chosen.episode >= known):
-        raise ValueError(f"--episode {chosen.episode}: needs 0 … {known - 1 if known else ''}")
+        most = f" … {known - 1}" if known else " or more"
+        raise ValueError(f"--episode {chosen.episode}: needs 0{most}")
     game = setup.game(1, chosen.episode)
     table = Table(title=f"{name} plays {setup}, episode {chosen.episode}")
     for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
@@ -96,6 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
+    except KeyboardInterrupt:
+        options.exit(130, f"{options.prog}: interrupted\n")
     except (ValueError, OSError) as error:
         options.exit(2, f"{options.prog}: {error}\n")
     return 0

@@ -1,5 +1,6 @@
 """The trained checkpoints of models/ play right after installation, as their cards say."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import torch
 import yaml
 
 from marl_pack import config
-from marl_pack.agents import checkpoint
+from marl_pack.agents import checkpoint, planning
 from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.model import Actor
+from marl_pack.agents.symmetry import mean_probabilities
 from marl_pack.evaluate import main
 from marl_pack.packing import Packing
 from marl_pack.play import main as play
@@ -79,6 +82,20 @@ def test_only_learned_agents_are_asked_in_all_symmetries(
     with pytest.raises(SystemExit):
         main(["--policy", "dblf", "--symmetric", "--episodes", "2"])
     assert "--symmetric goes with" in capsys.readouterr().err
-    command = ["--policy", str(MODELS[-1]), "dblf", "--symmetric", "--episodes", "2"]
+
+
+@pytest.mark.parametrize("plan", [[], ["--plan", "rollouts=1,top=2,depth=1"]])
+def test_the_option_reaches_the_agents(
+    plan: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = set()
+
+    def spied(actor: Actor, observation: Mapping[str, torch.Tensor], agent: str) -> torch.Tensor:
+        asked.add(agent)
+        return mean_probabilities(actor, observation, agent)
+
+    monkeypatch.setattr(planning if plan else checkpoint, "mean_probabilities", spied)
+    command = ["--policy", str(MODELS[-1]), "--symmetric", "--episodes", "2", *plan]
     assert main(command) == 0
-    assert main([*command, "--plan", "rollouts=1,top=2,depth=1"]) == 0
+    assert asked == {"orientation", "placement"}
+    assert "learned agents asked in all" in " ".join(capsys.readouterr().out.split())

@@ -56,6 +56,10 @@ class Actor(MLPModel):
         self.distribution.mask = obs["mask"]
         return self.cnns.keep(obs)
 
+    def log_probs(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Log-probabilities of all actions, float32 [B, K]; draws no random numbers."""
+        return self.distribution.masked(self.mlp(self.get_latent(obs))).log_softmax(-1)
+
 
 class Critic(MLPModel):
     """An agent's value of the state it sees at its turn, [B, 1].

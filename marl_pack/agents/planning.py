@@ -89,7 +89,8 @@ class Planner:
         plan: how far to look.
         futures: what may come, e.g. ``make_stream("rs", …)``; drawn anew for every decision.
         seed: of the futures.
-        symmetric: whether the agents are asked in all symmetries of the bin which pairs are best.
+        symmetric: whether the agents are asked in all symmetries of the bin which pairs are best;
+            what is imagined they play asked once.
     """
 
     def __init__(
@@ -199,8 +200,7 @@ class Planner:
         actor = self.orientation_agent if agent == "orientation" else self.placement_agent
         if self.symmetric:
             return mean_probabilities(actor, seen, agent).double()
-        actor(seen, stochastic_output=True)
-        return actor.output_distribution_params[0].double().exp()
+        return actor.log_probs(seen).double().exp()
 
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
         """What share of each bin is full in the end [N].

@@ -34,8 +34,9 @@ def count(width: int, depth: int) -> int:
 def mean_probabilities(actor: Actor, observation: Mapping[str, Tensor], agent: str) -> Tensor:
     """How probable each action is in the mean over the bin's symmetries, float32 [N, K].
 
-    The actor judges the same decision as often as the bin has symmetries, and its errors partly
-    cancel.
+    The actor judges the same decision as often as the bin has symmetries. Where items have their
+    centre of mass off centre, or o may be chosen but not o ^ 1, a mirrored state is only nearly one
+    of the game; what is legal stays what the game says.
 
     Args:
         actor: the agent's network.
@@ -49,8 +50,7 @@ def mean_probabilities(actor: Actor, observation: Mapping[str, Tensor], agent: s
     kinds = count(*shape)
     for kind in range(kinds):
         symmetry = torch.full((len(mask),), kind, device=mask.device)
-        actor(see(observation, agent, symmetry), stochastic_output=True)
-        log_probs = actor.output_distribution_params[0]
+        log_probs = actor.log_probs(see(observation, agent, symmetry))
         total += log_probs.exp().gather(1, carry(actions, item, shape, agent, symmetry))
     return total / kinds
 
