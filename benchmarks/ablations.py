@@ -3,7 +3,8 @@
 Every config in ``configs/ablations`` is trained with three seeds for the same number of items. With
 ``--config`` and ``--changes`` it is one config, each time with the options of one change. Runs that
 are there already are gone on with or just read. The figure of a run is its last evaluation, on the
-same held-out sequences for all; the interval is Student's over the seeds.
+same held-out sequences for all; intervals are Student's over the seeds, and so is that of the
+difference to the first row, taken seed by seed.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy import stats
+from numpy.typing import NDArray
 
 from benchmarks.learning_curve import history
+from benchmarks.planning import spread
 from benchmarks.timing import show
 from marl_pack.config import parse
 
@@ -66,17 +68,18 @@ def main() -> None:
     else:
         named = [CONFIGS / f"{n}.yaml" for n in chosen.names] or sorted(CONFIGS.glob("*.yaml"))
         runs = {config.stem: (config, "") for config in named}
-    table = []
+    table: list[list[str]] = []
+    first: NDArray[np.float64] | None = None
     for name, (config, change) in runs.items():
         given = ["--config", str(config), *shlex.split(chosen.every), *shlex.split(change)]
         last = [history(train(name, given, seed, chosen.folder))[-1] for seed in SEEDS]
-        u = 100 * np.array([row["utilization"] for row in last])
-        bounds = stats.ttest_1samp(u, 0.0).confidence_interval(0.95)
+        u = np.array([row["utilization"] for row in last])
+        first = u if first is None else first
         minutes = np.mean([row["seconds"] for row in last]) / 60
-        table.append([name, f"{u.mean():.2f} ± {(bounds.high - bounds.low) / 2:.2f}",
-                      " ".join(f"{value:.2f}" for value in u), f"{last[0]['items']:,.0f}",
-                      f"{minutes:.1f}"])  # fmt: skip
-    columns = ["config", "utilization %", "each seed", "items", "minutes"]
+        table.append([name, spread(u).lstrip("+"), " ".join(f"{100 * v:.2f}" for v in u),
+                      spread(u - first) if table else "",
+                      f"{last[0]['items']:,.0f}", f"{minutes:.1f}"])  # fmt: skip
+    columns = ["config", "utilization %", "each seed", "difference", "items", "minutes"]
     show(f"ablations, {len(SEEDS)} seeds", columns, table)
 
 

@@ -42,6 +42,13 @@ def in_mirrored_bin(game: Packing, symmetry: int) -> Packing:
     return other
 
 
+def observed(agent: str, game: Packing, chosen: Tensor) -> dict[str, Tensor]:
+    """What the agent sees, the placement agent with these orientations."""
+    if agent == "placement":
+        return placement.observe(game, PLANES, chosen)
+    return {"orientation": orientation, "joint": joint}[agent].observe(game, PLANES)
+
+
 @pytest.mark.parametrize("symmetry", range(8))
 @pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
 def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symmetry: int) -> None:
@@ -51,15 +58,8 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
     turned = chosen ^ 1 if symmetry & 4 else chosen
     cells = SIZE[0] * SIZE[1]
     kinds = torch.full((game.n,), symmetry)
-    if agent == "orientation":
-        seen, action = orientation.observe(game, PLANES), chosen
-        expected = orientation.observe(other, PLANES)
-    elif agent == "placement":
-        seen, action = placement.observe(game, PLANES, chosen), cell
-        expected = placement.observe(other, PLANES, turned)
-    else:
-        seen, action = joint.observe(game, PLANES), chosen * cells + cell
-        expected = joint.observe(other, PLANES)
+    seen, expected = observed(agent, game, chosen), observed(agent, other, turned)
+    action = {"orientation": chosen, "placement": cell, "joint": chosen * cells + cell}[agent]
     moved, new = transform(seen, action[:, None].float(), agent, kinds)
     for name, values in expected.items():
         assert torch.equal(moved[name], values), name
@@ -101,12 +101,7 @@ def test_the_mean_over_the_symmetries_is_the_same_in_the_mirrored_bin(
             weight.normal_()
     game = played(size)
     chosen, _ = make_policy("random", 3)(game)
-    if agent == "orientation":
-        seen = orientation.observe(game, PLANES)
-    elif agent == "placement":
-        seen = placement.observe(game, PLANES, chosen)
-    else:
-        seen = joint.observe(game, PLANES)
+    seen = observed(agent, game, chosen)
     here = mean_probabilities(actor, seen, agent)
     assert torch.allclose(here.sum(1), torch.ones(game.n))
     assert (here[~seen["mask"]] == 0).all()
