@@ -23,7 +23,7 @@ from numba import njit
 from torch import Tensor
 
 from marl_pack.bins import ORIENTATIONS, Bins, compiled, footprint
-from marl_pack.stability import hull_cpu, hull_torch
+from marl_pack.stability import bitboards, hull_cpu, hull_torch
 
 MOST_LENGTHS = 5
 """Of so many lengths of a side boxes are made at most."""
@@ -118,20 +118,14 @@ def _set_down(
 
 @njit(cache=True, nogil=True)
 def _judge(
-    masks: Any, best_level: Any, lengths: int, fitting: Any, ways: Any, cells: Any, chance: Any
+    masks: Any, best_level: Any, lengths: Any, fitting: Any, cells: Any, tallest: Any
 ) -> None:
-    """Both numbers of each placement.
+    """What :func:`marl_pack.stability.bitboards.judge` says, from masks.
 
     Args:
         masks, best_level: [K, L · L, W · D], of boxes of the least height on each footprint.
-        lengths: how many, L.
-        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
-        ways: int64 [A, 3], the orientations the next item may have.
-        cells, chance: float32 [K], written.
+        lengths, fitting, cells, tallest: as there.
     """
-    tallest = np.empty((lengths, lengths), np.int64)  # of how many lengths a box fits somewhere
-    item = np.empty(3, np.int64)
-    items = lengths**3
     for k in range(masks.shape[0]):
         total = 0
         for p in range(masks.shape[1]):
@@ -141,13 +135,28 @@ def _judge(
                     fit = fitting[best_level[k, p, c] >> 1]
                     total += fit
                     most = max(most, fit)
-            tallest[p // lengths, p % lengths] = most
-        cells[k] = total / items
+            tallest[k, p // lengths.size, p % lengths.size] = most
+        cells[k] = total
+
+
+@njit(cache=True, nogil=True)
+def _chance(tallest: Any, ways: Any, chance: Any) -> None:
+    """The share of the boxes that may come which have a place in an orientation they may have.
+
+    Args:
+        tallest: int64 [K, L, L], of how many lengths a box on each footprint fits somewhere.
+        ways: int64 [A, 3], the orientations.
+        chance: float32 [K], written.
+    """
+    lengths = tallest.shape[1]
+    item = np.empty(3, np.int64)
+    items = lengths**3
+    for k in range(tallest.shape[0]):
         found = 0
         for i in range(items):
             item[0], item[1], item[2] = i // lengths**2, i // lengths % lengths, i % lengths
             for a in range(ways.shape[0]):
-                if tallest[item[ways[a, 0]], item[ways[a, 1]]] > item[ways[a, 2]]:
+                if tallest[k, item[ways[a, 0]], item[ways[a, 1]]] > item[ways[a, 2]]:
                     found += 1
                     break
         chance[k] = found / items
@@ -175,31 +184,28 @@ def _room_cpu(
 ) -> tuple[Tensor, Tensor]:
     own, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
     placements = _placements(legal, own)
-    shape, count = bins.size[:2], len(placements)
-    footprints = [(w, d, lengths[0]) for w, d in product(lengths, repeat=2)]
-    threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
-    fit_at_once = max(1, AT_ONCE // (len(footprints) * shape[0] * shape[1]))
-    most = max(1, min(-(-count // threads), fit_at_once))
-    boxes = np.tile(np.array(footprints, np.int16), (most, 1, 1))
+    count, reach = len(placements), np.array(lengths)
     free = bins.height - np.arange(bins.height + 1)
-    fitting = (np.array(lengths) <= free[:, None]).sum(1)
+    fitting = (reach <= free[:, None]).sum(1)
     ways = np.array([ORIENTATIONS[o] for o in orientations])
-    cells, chance = np.empty((2, count), np.float32)
+    cells, chance = np.empty(count, np.int64), np.empty(count, np.float32)
     heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
+    small = bitboards.hold(*bins.size[:2])
+    threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
+    at_once = count if small else AT_ONCE // (len(lengths) ** 2 * heightmap[0].size)
+    most = max(1, min(-(-count // threads), at_once))
 
     def judge(start: int) -> None:
-        some = placements[start : start + most]
-        n = len(some)
-        maps = np.empty((2, n, *shape), np.int16)
-        _set_down(heightmap, empty_map, own, some, maps[0], maps[1])
-        masks = np.empty((n, len(footprints), *shape), np.uint8)
-        levels = np.empty((n, *shape), hull_cpu.level_dtype(bins.height))
-        best_level = np.empty(masks.shape, levels.dtype)
-        hull_cpu.hull_mask(maps[0], maps[1], boxes[:n], bins.height, levels, masks, best_level)
-        _judge(
-            masks.reshape(n, len(footprints), -1), best_level.reshape(n, len(footprints), -1),
-            len(lengths), fitting, ways, cells[start : start + n], chance[start : start + n],
-        )  # fmt: skip
+        part = slice(start, start + most)
+        some = placements[part]
+        tallest = np.empty((len(some), len(lengths), len(lengths)), np.int64)
+        if small:
+            bitboards.judge(
+                heightmap, empty_map, own, some, reach, fitting, cells[part], tallest
+            )
+        else:
+            _judge_masks(bins, own, some, reach, fitting, cells[part], tallest)
+        _chance(tallest, ways, chance[part])
 
     if threads == 1:
         for start in range(0, count, most):
@@ -207,8 +213,28 @@ def _room_cpu(
     else:
         list(_workers(threads).map(judge, range(0, count, most)))
     room, fits = np.zeros((2, *mask.shape), np.float32)
-    _write(legal, own, placements, cells, chance, room, fits)
+    mean = (cells / len(lengths) ** 3).astype(np.float32)
+    _write(legal, own, placements, mean, chance, room, fits)
     return torch.from_numpy(room), torch.from_numpy(fits)
+
+
+def _judge_masks(
+    bins: Bins, sides: Any, placements: Any, lengths: Any, fitting: Any, cells: Any, tallest: Any
+) -> None:
+    """:func:`marl_pack.stability.bitboards.judge` for floors of any size."""
+    n, shape = len(placements), bins.size[:2]
+    maps = np.empty((2, n, *shape), np.int16)
+    _set_down(bins.heightmap.numpy(), bins.empty_map.numpy(), sides, placements, maps[0], maps[1])
+    footprints = [(w, d, lengths[0]) for w, d in product(lengths, repeat=2)]
+    boxes = np.tile(np.array(footprints, np.int16), (n, 1, 1))
+    masks = np.empty((n, len(footprints), *shape), np.uint8)
+    levels = np.empty((n, *shape), hull_cpu.level_dtype(bins.height))
+    best_level = np.empty(masks.shape, levels.dtype)
+    hull_cpu.hull_mask(maps[0], maps[1], boxes, bins.height, levels, masks, best_level)
+    _judge(
+        masks.reshape(*masks.shape[:2], -1), best_level.reshape(*masks.shape[:2], -1),
+        lengths, fitting, cells, tallest,
+    )  # fmt: skip
 
 
 # --- tensor code ----------------------------------------------------------------------------------

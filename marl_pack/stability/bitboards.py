@@ -1,0 +1,283 @@
+"""What placements leave on floors of at most 128 cells: sets of cells as the bits of two words.
+
+Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit moved by whole numbers, and
+the corners of all windows that hold a cell of a set are that set moved and united. What makes
+``hull_alpha`` fast on maps (:mod:`marl_pack.stability.hull_cpu`) is said here of sets: level by level,
+the windows without anything higher in which each quadrant around the middle, or only each half, holds
+a bearing cell of that level. Corners whose windows reach over a row's end are left out at the end.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, uint64
+
+MOST_CELLS = 128
+STEEPEST = 1e6
+"""More than any rise to a corner that is not right above."""
+
+
+def hold(width: int, depth: int) -> bool:
+    """Whether a floor's cells are bits of two words, and those of a row of one."""
+    return width * depth <= MOST_CELLS and depth <= MOST_CELLS // 2
+
+
+@njit(cache=True, inline="always")
+def _later(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
+    """The set moved down by 0 … 127 bits: bit i of the result is bit i + ``bits`` of the set."""
+    if bits >= 64:
+        return high >> uint64(bits - 64), uint64(0)
+    if bits == 0:
+        return low, high
+    return (low >> uint64(bits)) | (high << uint64(64 - bits)), high >> uint64(bits)
+
+
+@njit(cache=True, inline="always")
+def _size(word: Any) -> int:
+    """How many bits of a word are 1."""
+    word = word - ((word >> uint64(1)) & uint64(0x5555555555555555))
+    word = (word & uint64(0x3333333333333333)) + ((word >> uint64(2)) & uint64(0x3333333333333333))
+    word = (word + (word >> uint64(4))) & uint64(0x0F0F0F0F0F0F0F0F)
+    return int((word * uint64(0x0101010101010101)) >> uint64(56))
+
+
+@njit(cache=True)
+def _window(depth: int, x: int, y: int, w: int, d: int) -> tuple[Any, Any]:
+    """The cells from (x, y) on to x + w - 1, y + d - 1."""
+    low, high = uint64(0), uint64(0)
+    for i in range(x, x + w):
+        for j in range(y, y + d):
+            bit = i * depth + j
+            if bit < 64:
+                low |= uint64(1) << uint64(bit)
+            else:
+                high |= uint64(1) << uint64(bit - 64)
+    return low, high
+
+
+@njit(cache=True, inline="always")
+def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
+    """Unite ``grown`` [2] with ``source`` [2] moved down by ``first`` … ``end`` - 1 strides."""
+    for step in range(first, end):
+        low, high = _later(source[0], source[1], step * stride)
+        grown[0] |= low
+        grown[1] |= high
+
+
+@njit(cache=True)
+def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
+    """Corners of the windows of every size up to R × S that hold one of ``cells``.
+
+    Args:
+        cells: uint64 [2], a set.
+        depth: D.
+        spare: uint64 [2], scratch.
+        boards: uint64 [R + 1, S + 1, 2], written from [1, 1] on.
+    """
+    spare[0], spare[1] = cells[0], cells[1]
+    for d in range(1, boards.shape[1]):
+        _grow(cells, d - 1, d, 1, spare)
+        boards[1, d, 0], boards[1, d, 1] = spare[0], spare[1]
+    for w in range(2, boards.shape[0]):
+        for d in range(1, boards.shape[1]):
+            boards[w, d, 0], boards[w, d, 1] = boards[w - 1, d, 0], boards[w - 1, d, 1]
+            _grow(boards[1, d], w - 1, w, depth, boards[w, d])
+
+
+@njit(cache=True, inline="always")
+def _first(word: Any) -> int:
+    """The lowest bit that is 1."""
+    return _size((word & (~word + uint64(1))) - uint64(1))
+
+
+@njit(cache=True, inline="always")
+def _last(word: Any) -> int:
+    """The highest bit that is 1."""
+    for step in (1, 2, 4, 8, 16, 32):
+        word |= word >> uint64(step)
+    return _size(word) - 1
+
+
+@njit(cache=True)
+def _rises(w: int, d: int, rises: Any) -> None:
+    """How steeply the hull rises from a window's middle to each of its cells.
+
+    The middle is inside the hull of cells if above it, and likewise below, the steepest rise to a
+    corner on its left and the steepest to one on its right add up to more than 0. A corner right
+    above counts as the steepest of its cell's side.
+
+    Args:
+        rises: float64 [w, d, 2], written: to the cell (x, y)'s upper corners on the left of the
+            middle and on its right; -inf where it has none. For the way down, y from the other end.
+    """
+    for x in range(w):
+        for y in range(d):
+            rises[x, y] = -np.inf
+            side = 0 if 2 * x + 1 < w else 1
+            for corner in (x, x + 1):
+                run, rise = 2 * corner - w, 2 * y + 2 - d
+                if run:
+                    which = 0 if run < 0 else 1
+                    rises[x, y, which] = max(rises[x, y, which], rise / abs(run))
+                elif rise > 0:
+                    rises[x, y, side] = STEEPEST
+
+
+@njit(cache=True)
+def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> tuple[Any, Any]:
+    """Of the windows with these ``corners`` [2] those whose middle ``cells`` [2] hold up."""
+    found_low, found_high = uint64(0), uint64(0)
+    row = ~uint64(0) >> uint64(64 - d)
+    for word in range(2):
+        left = corners[word]
+        while left:
+            lowest = left & (~left + uint64(1))
+            left ^= lowest
+            corner = 64 * word + _size(lowest - uint64(1))
+            up_left, up_right, down_left, down_right = -np.inf, -np.inf, -np.inf, -np.inf
+            for x in range(w):
+                held = _later(cells[0], cells[1], corner + x * depth)[0] & row
+                if held:
+                    top, bottom = _last(held), d - 1 - _first(held)
+                    up_left = max(up_left, rises[x, top, 0])
+                    up_right = max(up_right, rises[x, top, 1])
+                    down_left = max(down_left, rises[x, bottom, 0])
+                    down_right = max(down_right, rises[x, bottom, 1])
+            # Rises are fractions of whole numbers up to 128: their sums are 0 or well off it.
+            if up_left + up_right > 1e-6 and down_left + down_right > 1e-6:
+                if word == 0:
+                    found_low |= lowest
+                else:
+                    found_high |= lowest
+    return found_low, found_high
+
+
+@njit(cache=True, nogil=True)
+def judge(
+    heightmap: Any, hollow: Any, sides: Any, placements: Any, lengths: Any, fitting: Any,
+    cells: Any, tallest: Any,
+) -> None:  # fmt: skip
+    """For each placement and each footprint of what may come, the cells where it may be set down.
+
+    Args:
+        heightmap, hollow: int16 [N, W, D], of a floor that :func:`hold` says yes to.
+        sides: int16 [N, A, 3].
+        placements: int64 [K, 4], bin, orientation and cell, legal; those of a bin in one piece.
+        lengths: int64 [L], ascending.
+        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
+        cells: int64 [K], written: cells where a box may be set down, over all L³ boxes.
+        tallest: int64 [K, L, L], written: of how many lengths boxes on a footprint have a place.
+    """
+    width, depth = heightmap.shape[1:]
+    count, most = lengths.size, fitting.size
+    fit_w, fit_d = int((lengths <= width).sum()), int((lengths <= depth).sum())
+    valid = np.zeros((count, count, 2), np.uint64)
+    for i in range(fit_w):
+        for j in range(fit_d):
+            across, along = width - lengths[i] + 1, depth - lengths[j] + 1
+            valid[i, j, 0], valid[i, j, 1] = _window(depth, 0, 0, across, along)
+    reach_w = (lengths[fit_w - 1] + 1) // 2 if fit_w else 0
+    reach_d = (lengths[fit_d - 1] + 1) // 2 if fit_d else 0
+    own = np.empty((most, 2, 2), np.uint64)  # of each level: bearing cells, all cells
+    after = np.empty((most, 2, 2), np.uint64)
+    quarters = np.empty((reach_w + 1, reach_d + 1, 2), np.uint64)
+    above = np.empty(2, np.uint64)
+    deep = np.empty((count, 2), np.uint64)  # corners below which something is higher, in a row
+    blocked = np.empty((count, 2), np.uint64)  # and in all rows so far
+    undecided = np.empty(2, np.uint64)
+    rises = np.empty((fit_w, fit_d, width, depth, 2))
+    for i in range(fit_w):
+        for j in range(fit_d):
+            _rises(lengths[i], lengths[j], rises[i, j])
+    shown = -1
+    for k in range(placements.shape[0]):
+        b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
+        if b != shown:
+            shown = b
+            _levels(heightmap[b], hollow[b], own)
+        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
+        _set_down(own, _window(depth, x, y, w, d), h, after)
+        total = 0
+        tallest[k] = 0
+        above[:] = uint64(0)
+        for level in range(most - 1, -1, -1):
+            fit = fitting[level]
+            if fit and (after[level, 0, 0] | after[level, 0, 1]):
+                _corners(after[level, 0], depth, undecided, quarters)
+                deep[0] = above
+                for j in range(fit_d):
+                    if j:
+                        deep[j] = deep[j - 1]
+                    _grow(above, lengths[j - 1] if j else 1, lengths[j], 1, deep[j])
+                    blocked[j] = deep[j]
+                last = fit_d
+                for i in range(fit_w):
+                    half_w = (lengths[i] + 1) // 2
+                    across = (lengths[i] - half_w) * depth
+                    for j in range(last):
+                        _grow(deep[j], lengths[i - 1] if i else 1, lengths[i], depth, blocked[j])
+                        free_low = valid[i, j, 0] & ~blocked[j, 0]
+                        free_high = valid[i, j, 1] & ~blocked[j, 1]
+                        if not (free_low | free_high):
+                            last = j  # nor has anything longer a place on this level
+                            break
+                        half_d = (lengths[j] + 1) // 2
+                        along = lengths[j] - half_d
+                        a_low, a_high = quarters[half_w, half_d]
+                        b_low, b_high = _later(a_low, a_high, along)
+                        c_low, c_high = _later(a_low, a_high, across)
+                        d_low, d_high = _later(a_low, a_high, across + along)
+                        yes_low = free_low & a_low & b_low & c_low & d_low
+                        yes_high = free_high & a_high & b_high & c_high & d_high
+                        undecided[0] = free_low & ~yes_low & (a_low | b_low) & (c_low | d_low) & (
+                            a_low | c_low
+                        ) & (b_low | d_low)  # fmt: skip
+                        undecided[1] = free_high & ~yes_high & (a_high | b_high) & (
+                            c_high | d_high
+                        ) & (a_high | c_high) & (b_high | d_high)  # fmt: skip
+                        if undecided[0] | undecided[1]:
+                            more_low, more_high = _exact(
+                                after[level, 0], undecided, depth, lengths[i], lengths[j],
+                                rises[i, j],
+                            )  # fmt: skip
+                            yes_low, yes_high = yes_low | more_low, yes_high | more_high
+                        if yes_low | yes_high:
+                            total += fit * (_size(yes_low) + _size(yes_high))
+                            tallest[k, i, j] = max(tallest[k, i, j], fit)
+            above[0] |= after[level, 1, 0]
+            above[1] |= after[level, 1, 1]
+        cells[k] = total
+
+
+@njit(cache=True)
+def _levels(heights: Any, hollow: Any, own: Any) -> None:
+    """Bearing and all cells of each level, uint64 [H + 1, 2, 2], of maps [W, D]."""
+    depth = heights.shape[1]
+    own[:] = uint64(0)
+    for i in range(heights.shape[0]):
+        for j in range(depth):
+            bit, level = i * depth + j, heights[i, j]
+            one = uint64(1) << uint64(bit & 63)
+            own[level, 1, bit >> 6] |= one
+            if hollow[i, j] == 0:
+                own[level, 0, bit >> 6] |= one
+
+
+@njit(cache=True, inline="always")
+def _set_down(own: Any, under: Any, h: int, after: Any) -> None:
+    """The levels after a box of height ``h`` has been set down on the cells ``under``."""
+    low, high = under
+    rest = 0
+    for level in range(own.shape[0]):
+        if (own[level, 1, 0] & low) | (own[level, 1, 1] & high):
+            rest = level
+        for which in range(2):
+            after[level, which, 0] = own[level, which, 0] & ~low
+            after[level, which, 1] = own[level, which, 1] & ~high
+    # What rests on a bearing cell bears.
+    after[rest + h, 0, 0] |= own[rest, 0, 0] & low
+    after[rest + h, 0, 1] |= own[rest, 0, 1] & high
+    after[rest + h, 1, 0] |= low
+    after[rest + h, 1, 1] |= high
