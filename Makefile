@@ -48,6 +48,7 @@ train: $(STAMP)  ## train for a few minutes, then compare with heuristics
 benchmark: $(STAMP)  ## every figure of docs/results.md on speed
 	$(BIN)/python -m benchmarks.masks
 	$(BIN)/python -m benchmarks.rules
+	$(BIN)/python -m benchmarks.room
 	$(BIN)/python -m benchmarks.game
 	$(BIN)/python -m benchmarks.training
 

@@ -1,8 +1,9 @@
 """Write a checkpoint's agents for use elsewhere: ONNX, or rsl_rl's own format.
 
 ``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
-the checkpoint. Batch and bin size are free. The masks are inputs and are applied inside: an illegal
-action has probability 0 and is never the best.
+the checkpoint, and ``AGENT_afterstates.onnx``, the critic of afterstates of an agent that hears
+one. Batch and bin size are free. The masks are inputs and are applied inside: an illegal action has
+probability 0 and is never the best.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from marl_pack.agents import checkpoint
+from marl_pack.agents.afterstate import FEATURES, AfterstateCritic
 from marl_pack.agents.model import AGENTS, Actor
 from marl_pack.files import write_atomically
 
@@ -72,11 +74,11 @@ def example(agent: str, planes: Sequence[str], batch: int, size: tuple[int, int,
         seen["rest"] = draw(height, *shape)
     if "waste" in planes:
         seen["waste"] = draw(20, *shape)
-    for plane in ("room", "fits"):
+    for plane in ("room", "fits", "worth"):
         if plane in planes:
             seen[plane] = torch.rand(shape, generator=generator)
-    if "room" in planes:
-        seen["best_room"] = torch.ones(batch, 1)
+            if plane != "fits":
+                seen[f"best_{plane}"] = torch.ones(batch, 1)
     if "solid" in planes:
         seen["solid"] = torch.ones(batch, width, depth, dtype=torch.bool)
     if "filled" in planes:
@@ -89,9 +91,9 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 
     Inputs are the groups of the agent's ``observe``, whole numbers as int64: ``heightmap``
     [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and ``cells`` bool,
-    ``rest``, ``waste``, float32 ``room``, ``fits`` [B, A, W, D], ``best_room``, ``filled``
-    [B, 1], ``solid`` bool [B, W, D] where its network has these planes. Outputs are ``action``
-    int64 [B] and ``probabilities`` float32 [B, K].
+    ``rest``, ``waste``, float32 ``room``, ``fits``, ``worth`` [B, A, W, D], ``best_room``,
+    ``best_worth``, ``filled`` [B, 1], ``solid`` bool [B, W, D] where its network has these planes.
+    Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
 
     Returns:
         The names of the inputs.
@@ -108,10 +110,11 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
         "item": {0: batch},
         "height": {0: batch},
         "best_room": {0: batch},
+        "best_worth": {0: batch},
         "filled": {0: batch},
         "mask": {0: batch} if agent == "orientation" else {0: batch, 1: actions},
     }
-    for plane in ("cells", "rest", "waste", "room", "fits"):
+    for plane in ("cells", "rest", "waste", "room", "fits", "worth"):
         shapes[plane] = {0: batch, 2: width, 3: depth}
     shapes["solid"] = shapes["heightmap"]
     with warnings.catch_warnings():
@@ -121,9 +124,30 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
             input_names=names, output_names=["action", "probabilities"], verbose=False,
             dynamic_shapes=(tuple(shapes[name] for name in names),),
         )  # fmt: skip
-    assert program is not None
-    write_atomically(path, lambda file: file.write(program.model_proto.SerializeToString()))
+    _write(program, path)
     return names
+
+
+def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
+    """Write the critic of afterstates: ``features`` float32 [K, F] → ``value`` float32 [K].
+
+    What a placement is worth is its reward and this value of
+    :func:`marl_pack.agents.afterstate.features`.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            critic.eval(), (torch.zeros(2, FEATURES),), dynamo=True, opset_version=OPSET,
+            input_names=["features"], output_names=["value"], verbose=False,
+            dynamic_shapes=({0: torch.export.Dim("placements", min=1)},),
+        )  # fmt: skip
+    _write(program, path)
+
+
+def _write(program: torch.onnx.ONNXProgram | None, path: Path) -> None:
+    assert program is not None
+    content = program.model_proto.SerializeToString()
+    write_atomically(path, lambda file: file.write(content))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -158,8 +182,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 console.print(f"{path}: for rsl_rl's PPO.load", soft_wrap=True)
                 continue
             path = folder / f"{name}.onnx"
-            inputs = export_onnx(checkpoint.load_actor(found, name, "cpu"), name, path)
+            actor = checkpoint.load_actor(found, name, "cpu")
+            inputs = export_onnx(actor, name, path)
             console.print(f"{path}: inputs {', '.join(inputs)}", soft_wrap=True)
+            if actor.afterstates is not None:
+                path = folder / f"{name}_afterstates.onnx"
+                export_afterstates(actor.afterstates, path)
+                console.print(f"{path}: what {name} hears of placements", soft_wrap=True)
     except ModuleNotFoundError as error:
         options.exit(2, f"{options.prog}: {error}; install marl_pack[export]\n")
     except (ValueError, OSError) as error:

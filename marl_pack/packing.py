@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from marl_pack.bins import ORIENTATIONS, check_device, check_size
 from marl_pack.items import DEFAULT_SIDES, Stream, fingerprint, make_stream
 from marl_pack.stability import Candidates, Rule, candidates, make_rule
 from marl_pack.stability.candidates import NO_OFFSET, check_com_offset
-from marl_pack.stability.room import probe_lengths, room_left
+from marl_pack.stability.room import Left, left_after, probe_lengths
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
 
@@ -159,7 +159,8 @@ class Packing:
             most = min(most, self.stream.longest)
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
-        self._room: tuple[Tensor, ...] | None = None
+        self._left: Left | None = None
+        self._known: dict[Hashable, Tensor] = {}
         self.reset(seed, first_episode)
 
     def reset(self, seed: int | None = None, first_episode: int = 0) -> None:
@@ -180,17 +181,38 @@ class Packing:
         if self.auto_reset:
             self._begin((~self.alive).nonzero().squeeze(1))
 
-    def room(self) -> tuple[Tensor, ...]:
-        """What each legal placement would leave for the items that may come next.
+    def left(self) -> Left:
+        """What each legal placement of the visible items would leave; made once a turn.
 
-        Both numbers of :func:`marl_pack.stability.room.room_left`, float32 [N, 6, W, D], for boxes
-        with sides between the stream's shortest and longest; made once a turn.
+        For boxes with sides between the stream's shortest and longest.
         """
-        if self._room is None:
+        if self._left is None:
             sides = self.candidates(self.items, self.weights).sides
             lengths = probe_lengths(*self.stream.sides)
-            self._room = room_left(self.bins, sides, self.mask, lengths, self.orientations)
-        return self._room
+            self._left = left_after(self.bins, sides, self.mask, lengths)
+        return self._left
+
+    def room(self) -> tuple[Tensor, Tensor]:
+        """Room after each legal placement, float32 [N, 6, W, D] each; 0 where none is legal.
+
+        In how many cells a box that may come could be set down in the mean, and how probable it is
+        that the next item finds a place.
+        """
+        return (
+            self.once("room", lambda: self.left().spread(self.left().room(), self.mask)),
+            self.once("fits", lambda: self.left().spread(self.left().chance(self.orientations),
+                                                         self.mask)),
+        )  # fmt: skip
+
+    def once(self, what: Hashable, make: Callable[[], Tensor]) -> Tensor:
+        """What ``make`` gives [N, …], made once a turn; branches get their bins' part of it."""
+        if what not in self._known:
+            self._known[what] = make()
+        return self._known[what]
+
+    def forget(self, what: Hashable) -> None:
+        """Make it anew when it is next asked for: see :meth:`once`."""
+        self._known.pop(what, None)
 
     def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:
         """Bool [N, 6, W, D]: where ``items`` [N, 3] may be set down in ``bins``, each way."""
@@ -278,7 +300,7 @@ class Packing:
         game.n, game.auto_reset = len(which), False
         game._index = torch.arange(len(which), device=self.device)
         game.bins, game.bin_height = self.bins[which], self.bin_height[which]
-        game._room = None if self._room is None else tuple(made[which] for made in self._room)
+        game._left, game._known = None, {what: made[which] for what, made in self._known.items()}
         for name in ("items", "weights", "mask", "orientation_mask", "alive", "lost", "t"):
             setattr(game, name, getattr(self, name)[which])
         if stream is None:
@@ -342,7 +364,7 @@ class Packing:
 
     def _look(self) -> None:
         """Make the masks of the items that have come; a bin where none is legal has ended."""
-        self._room = None
+        self._left, self._known = None, {}
         self.mask = self.masks(self.bins, self.items, self.weights)
         if not self.mask_orientations:
             self.mask &= ~self.lost[:, None, None, None]

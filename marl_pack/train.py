@@ -250,7 +250,7 @@ class Display:
         if not math.isnan(progress.reward):
             shown.append(f"reward {progress.reward:.3f}")
         learned = []
-        for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses):
+        for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses if "/" in key):
             entropy, kl = (progress.losses[f"{name}/{what}"] for what in ("entropy", "kl"))
             learned.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
         return ["  ".join(shown), "  ".join(learned)]

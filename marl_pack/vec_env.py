@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.packing import Packing
 
 
@@ -40,6 +42,10 @@ class PackingVecEnv(VecEnv):
         self.device = game.device
         self.cfg = {} if cfg is None else cfg
         self.max_episode_length = game.bins.boxes.shape[1]
+        # Who says what placements are worth to agents that see it; PackingPPO teaches it.
+        self.afterstates: AfterstateCritic | None = None
+        if any("worth" in seen for seen in self.planes.values()):
+            self.afterstates = AfterstateCritic().to(self.device)
         self._heightmap: Tensor | None = None  # the copy that this step's observations share
 
     @property
@@ -54,11 +60,19 @@ class PackingVecEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """What the first agent sees: groups as :func:`marl_pack.agents.orientation.observe`."""
         if "joint" in self.planes:
-            seen = joint.observe(self.game, self.planes["joint"])
+            seen = joint.observe(self.game, self.planes["joint"], self.afterstates)
         else:
-            seen = orientation.observe(self.game, self.planes.get("orientation", ()))
+            planes = self.planes.get("orientation", ())
+            seen = orientation.observe(self.game, planes, self.afterstates)
         self._heightmap = seen["heightmap"]
         return TensorDict(seen, batch_size=[self.num_envs], device=self.device)
+
+    def look_again(self, seen: TensorDict) -> None:
+        """Write into ``seen`` what is seen now that the critic of afterstates has learned."""
+        if self.afterstates is not None:
+            self.game.forget(self.afterstates)
+            with torch.inference_mode():
+                seen.update_(self.get_observations())
 
     def orient(self, chosen: Tensor) -> TensorDict:
         """What the placement agent sees: groups as :func:`marl_pack.agents.placement.observe`.
@@ -67,7 +81,7 @@ class PackingVecEnv(VecEnv):
             chosen: int64 [N], the orientations. Nothing changes: it may be called again.
         """
         seen = placement.observe(
-            self.game, self.planes.get("placement", ()), chosen, self._heightmap
+            self.game, self.planes.get("placement", ()), chosen, self._heightmap, self.afterstates
         )
         return TensorDict(seen, batch_size=[self.num_envs], device=self.device)
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from marl_pack.agents import checkpoint, joint, orientation, placement
+from marl_pack.agents import checkpoint
+from marl_pack.agents.afterstate import AfterstateCritic, features
 from marl_pack.agents.model import make_actor
 from marl_pack.agents.trunk import PLANES
-from marl_pack.export import Exported, export_onnx, main
+from marl_pack.export import Exported, export_afterstates, export_onnx, main
 from marl_pack.packing import Packing
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -34,10 +35,8 @@ def test_an_exported_agent_agrees_with_pytorch(
         for _ in range(3):
             chosen = game.orientation_mask.int().argmax(1)
             game.place(chosen, game.orient(chosen).mask.flatten(1).int().argmax(1))
-        if agent == "placement":
-            seen = placement.observe(game, planes, game.orientation_mask.int().argmax(1))
-        else:
-            seen = (joint if agent == "joint" else orientation).observe(game, planes)
+        chosen = [game.orientation_mask.int().argmax(1)] if agent == "placement" else []
+        seen = actor.see(game, *chosen)
         with torch.inference_mode():
             action, probabilities = Exported(actor, names)(*(seen[name] for name in names))
         given = {name: seen[name].numpy() for name in names}
@@ -50,6 +49,19 @@ def test_an_exported_agent_agrees_with_pytorch(
         assert (out[1][~seen["mask"].numpy()] == 0).all()
 
 
+def test_an_exported_critic_of_afterstates_agrees_with_pytorch(tmp_path: Path) -> None:
+    critic = AfterstateCritic()
+    export_afterstates(critic, tmp_path / "afterstates.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "afterstates.onnx"))
+    game = Packing(3)
+    for _ in range(4):
+        seen = features(game.left(), game.volume)
+        value = session.run(["value"], {"features": seen.numpy()})[0]
+        np.testing.assert_allclose(value, critic(seen).detach().numpy(), atol=1e-6)
+        chosen = game.orientation_mask.int().argmax(1)
+        game.place(chosen, game.orient(chosen).mask.flatten(1).int().argmax(1))
+
+
 def test_the_command_writes_every_learned_agent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -57,12 +69,13 @@ def test_the_command_writes_every_learned_agent(
 
     options = ["--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
                "--ppo.max_iterations=1", "--evaluation.every=0", f"--output.folder={tmp_path}",
-               "--output.name=run", "--orientation.frozen=true",
-               "--orientation.policy=first"]  # fmt: skip
+               "--output.name=run", "--orientation.frozen=true", "--orientation.policy=first",
+               "--placement.network.planes=[worth]"]  # fmt: skip
     assert train(options) == 0
     assert main([str(tmp_path / "run")]) == 0
     assert "orientation: played by first" in capsys.readouterr().out
     assert (tmp_path / "run" / "placement.onnx").is_file()
+    assert (tmp_path / "run" / "placement_afterstates.onnx").is_file()
     assert main([str(tmp_path / "run"), "--format", "rsl_rl", "--folder", str(tmp_path / "o")]) == 0
     state = torch.load(tmp_path / "o" / "placement.pt", weights_only=True)
     found = checkpoint.read(tmp_path / "run")

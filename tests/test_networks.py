@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor, make_critic
 from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes, widen
@@ -13,9 +14,11 @@ SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
 
 
 def observed(agent: str, game: Packing, planes: tuple[str, ...]) -> dict[str, torch.Tensor]:
+    critic = AfterstateCritic()
     if agent == "placement":
-        return placement.observe(game, planes, game.orientation_mask.int().argmax(1))
-    return (joint if agent == "joint" else orientation).observe(game, planes)
+        chosen = game.orientation_mask.int().argmax(1)
+        return placement.observe(game, planes, chosen, afterstates=critic)
+    return (joint if agent == "joint" else orientation).observe(game, planes, critic)
 
 
 @pytest.mark.parametrize("agent", AGENTS)
@@ -43,8 +46,8 @@ def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
     assert planes[0, 1:, 2, 2].tolist() == [2 / 4, 3 / 6, 4 / 8]
     assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
     game = Packing(2, (6, 6, 6), sides=(2, 4))
-    seen = orientation.observe(game, PLANES)
-    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 5 * 6 + 3, 6, 6)
+    seen = orientation.observe(game, PLANES, AfterstateCritic())
+    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 7 * 6 + 4, 6, 6)
 
 
 def test_solid_are_the_columns_without_a_gap() -> None:
@@ -61,15 +64,16 @@ def test_solid_are_the_columns_without_a_gap() -> None:
 
 @pytest.mark.parametrize(("dilation", "far"), [(1, 3), (2, 5)])
 def test_three_layers_look_as_far_as_their_dilation_lets_them(dilation: int, far: int) -> None:
+    torch.manual_seed(0)
     trunk = Trunk(1, Network(channels=4, planes=[], dilation=dilation))
     seen = {
         "heightmap": torch.zeros(1, 15, 15),
         "item": torch.ones(1, 3),
         "height": torch.full((1, 1), 10),
     }
-    flat = trunk(seen)
+    flat = trunk(seen).whole
     seen["heightmap"][0, 7, 7] = 5
-    changed = (trunk(seen) != flat).any(1)[0].nonzero()
+    changed = (trunk(seen).whole != flat).any(1)[0].nonzero()
     assert changed.min(0).values.tolist() == [7 - far, 7 - far]
     assert changed.max(0).values.tolist() == [7 + far, 7 + far]
 
@@ -78,7 +82,7 @@ def test_with_a_shortcut_the_heads_see_the_planes() -> None:
     game = Packing(3, seed=1)
     seen = orientation.observe(game, ("mask", "room"))
     network = Network(channels=4, layers=2, planes=["mask", "room"], shortcut=True)
-    features = Trunk(6, network)(seen)
+    features = Trunk(6, network)(seen).whole
     planes = input_planes(seen, network.planes)
     assert features.shape == (3, 4 + 4 + 6 + 7, 10, 10)
     assert torch.equal(features[:, 4:], planes)
@@ -103,7 +107,7 @@ def test_room_is_seen_beside_the_most_there_is() -> None:
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:
     game = Packing(8, seed=1)
-    seen = orientation.observe(game, PLANES)
+    seen = orientation.observe(game, PLANES, AfterstateCritic())
     kept = {name: values.clone() for name, values in seen.items()}
     for _ in range(30):
         o = game.orientation_mask.int().argmax(1)

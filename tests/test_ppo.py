@@ -289,6 +289,7 @@ def test_a_critic_with_a_trunk_of_its_own_and_symmetry_learn_too() -> None:
 @pytest.mark.parametrize("options", [
     (), ("--joint=true",), ("--orientation.frozen=true", "--orientation.policy=random"),
     ("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--game.items=cut2"),
+    ("--orientation.network.planes=[mask,worth]", "--placement.network.planes=[worth,room]"),
 ])  # fmt: skip
 def test_a_resumed_run_gives_the_weights_of_one_never_stopped(
     options: tuple[str, ...], tmp_path: Path

@@ -9,8 +9,8 @@ import torch
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.packing import Packing
-from marl_pack.stability import reference
-from marl_pack.stability.room import WORTH_A_THREAD, _room_torch, probe_lengths, room_left
+from marl_pack.stability import bitboards, reference
+from marl_pack.stability.room import WORTH_A_THREAD, Left, _left_torch, left_after, probe_lengths
 
 GAMES = (
     {},
@@ -64,21 +64,70 @@ def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) ->
     assert not fits[~game.mask].any()
 
 
+def maps(left: Left, game: Packing) -> list[torch.Tensor]:
+    """Everything that is known of each placement, on the bins' maps."""
+    known = [left.counts.flatten(1), left.surface, left.volume[:, None], left.waste[:, None],
+             left.filled[:, None], left.room()[:, None],
+             left.chance(game.orientations)[:, None]]  # fmt: skip
+    return [torch.where(game.mask[..., None], values[left.index], 0) for values in known]
+
+
+def settings_of_left(game: Packing) -> tuple[object, ...]:
+    sides = game.candidates(game.items, game.weights).sides
+    return game.bins, sides, game.mask, probe_lengths(*game.stream.sides)
+
+
 @pytest.mark.parametrize("settings", GAMES)
 def test_tensor_code_gives_the_same_numbers(settings: dict[str, object]) -> None:
     game = in_play(6, 9, **settings)
-    sides = game.candidates(game.items, game.weights).sides
-    lengths = probe_lengths(*game.stream.sides)
-    compiled = room_left(game.bins, sides, game.mask, lengths, game.orientations)
-    tensors = _room_torch(game.bins, sides, game.mask, lengths, game.orientations)
-    for ours, theirs in zip(compiled, tensors, strict=True):
-        assert torch.equal(ours, theirs)
+    known = settings_of_left(game)
+    for ours, theirs in zip(
+        maps(left_after(*known), game), maps(_left_torch(*known), game), strict=True
+    ):
+        assert torch.allclose(ours.double(), theirs.double(), rtol=0, atol=1e-6)
+        if not ours.is_floating_point():
+            assert torch.equal(ours, theirs)
+
+
+@pytest.mark.parametrize("settings", GAMES[:3] + GAMES[4:])
+def test_sets_of_bits_say_what_maps_say(
+    settings: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    game = in_play(64, 12, **settings)
+    assert bitboards.hold(*game.size[:2])
+    known = settings_of_left(game)
+    bits = left_after(*known)
+    monkeypatch.setattr(bitboards, "hold", lambda width, depth: False)
+    assert torch.equal(left_after(*known).counts, bits.counts)
+
+
+def test_what_is_said_of_a_placement_is_what_it_does() -> None:
+    game = in_play(8, 5)
+    left = game.left()
+    policy = make_policy("random", seed=2)
+    o, c = policy(game)
+    row = left.index[torch.arange(8), o, c // 10, c % 10]
+    after = game.branch(torch.arange(8))
+    after.place(o, c)
+    assert torch.equal(left.filled[row], after.bins.filled)
+    assert torch.equal(left.volume[row], after.bins.filled - game.bins.filled)
+    hollow = [b.empty_map.sum((1, 2), dtype=torch.int64) for b in (game.bins, after.bins)]
+    assert torch.equal(left.waste[row], hollow[1] - hollow[0])
+    heights = after.bins.heightmap
+    for level in range(11):
+        share = (heights == level).float().mean((1, 2))
+        assert torch.allclose(left.surface[row, level], share)
+    steps = torch.cat([heights.diff(dim=axis).abs().flatten(1) for axis in (1, 2)], 1)
+    for step in range(6):
+        share = (steps.clamp(max=5) == step).float().mean(1)
+        assert torch.allclose(left.surface[row, 11 + step], share)
 
 
 def test_no_placement_no_room() -> None:
     game = Packing(2, (4, 4, 4), [[3, 3, 3]] * 3, auto_reset=False)
     while game.alive.any():
         game.place(*make_policy("dblf")(game))
+    assert game.left().room().shape == game.left().chance([0]).shape == (0,)
     room, fits = game.room()
     assert room.shape == fits.shape == (2, 6, 4, 4)
     assert not room.any()
@@ -124,12 +173,10 @@ def test_the_heuristic_leaves_more_than_others_do() -> None:
 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     game = in_play(12, 5)
-    sides = game.candidates(game.items, game.weights).sides
-    lengths = probe_lengths(*game.stream.sides)
     assert int(game.mask.sum()) > 3 * WORTH_A_THREAD  # so several share the work
     given = []
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda t=threads: t)
-        given.append(room_left(game.bins, sides, game.mask, lengths))
+        given.append(maps(left_after(*settings_of_left(game)), game))
     for alone, shared in zip(*given, strict=True):
         assert torch.equal(alone, shared)

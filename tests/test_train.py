@@ -84,7 +84,8 @@ def test_a_run_leaves_settings_checkpoints_logs_and_history(
 def test_tensorboards_scalars_are_those_that_the_docs_define(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    assert main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
+    worth = "--placement.network.planes=[mask,worth]"
+    assert main([*SMALL, worth, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
     docs = (Path(__file__).parent.parent / "docs" / "training.md").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents import joint
 from marl_pack.agents.heuristics import (
     ORIENTATION_AGENTS,
     POLICIES,
@@ -158,25 +158,20 @@ def learned_orientation_agent(actor: Actor, symmetric: bool = False) -> Orientat
         symmetric: whether it is asked in all symmetries of the bin
             (:func:`marl_pack.agents.symmetry.mean_probabilities`).
     """
-    planes = actor.cnns.planes
-    return lambda game: _best(actor, "orientation", orientation.observe(game, planes), symmetric)
+    return lambda game: _best(actor, "orientation", actor.see(game), symmetric)
 
 
 def learned_placement_agent(actor: Actor, symmetric: bool = False) -> PlacementAgent:
     """A network as the second agent; takes the most probable cell. Arguments as above."""
-    planes = actor.cnns.planes
-    return lambda game, chosen: _best(
-        actor, "placement", placement.observe(game, planes, chosen), symmetric
-    )
+    return lambda game, chosen: _best(actor, "placement", actor.see(game, chosen), symmetric)
 
 
 def learned_joint_policy(actor: Actor, symmetric: bool = False) -> Policy:
     """The joint agent's network; takes the most probable pair. Arguments as above."""
-    planes = actor.cnns.planes
 
     def play(game: Packing) -> Choice:
         cells = game.size[0] * game.size[1]
-        return joint.split(_best(actor, "joint", joint.observe(game, planes), symmetric), cells)
+        return joint.split(_best(actor, "joint", actor.see(game), symmetric), cells)
 
     return play
 

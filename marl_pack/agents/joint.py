@@ -11,15 +11,19 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from marl_pack.agents import orientation
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.agents.trunk import Network, ScoreMap
 from marl_pack.packing import Packing
 
 WAYS = orientation.WAYS
 
 
-def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
+def observe(
+    game: Packing, planes: Sequence[str] = (), afterstates: AfterstateCritic | None = None
+) -> dict[str, Tensor]:
     """What the orientation agent sees, with ``mask`` bool [N, 6 · W · D]."""
-    return orientation.observe(game, planes) | {"mask": game.mask.flatten(1)}
+    seen = orientation.observe(game, planes, afterstates)
+    return seen | {"mask": game.mask.flatten(1)}
 
 
 def make_head(network: Network) -> nn.Module:

@@ -11,8 +11,10 @@ from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
 from marl_pack.agents import joint, orientation, placement
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.agents.distribution import MaskedCategorical
-from marl_pack.agents.trunk import Network, Trunk, pooled_head
+from marl_pack.agents.trunk import Features, Network, Trunk, pooled_head
+from marl_pack.packing import Packing
 
 AGENTS: dict[str, ModuleType] = {
     "orientation": orientation,
@@ -30,7 +32,13 @@ class Actor(MLPModel):
         obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
         agent: one of :data:`AGENTS`.
         network: fields of :class:`marl_pack.agents.trunk.Network`.
+
+    Attributes:
+        afterstates: who says what placements are worth, if its network sees that, else None. Kept
+            with the actor's weights; it learns by itself.
     """
+
+    afterstates: AfterstateCritic | None
 
     def __init__(
         self,
@@ -47,12 +55,21 @@ class Actor(MLPModel):
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
         self.cnns = Trunk(AGENTS[agent].WAYS, shape)
         self.mlp = AGENTS[agent].make_head(shape)
+        self.afterstates = AfterstateCritic() if "worth" in shape.planes else None
         self.distribution = MaskedCategorical(1)
+        self._observe = AGENTS[agent].observe
+
+    def see(self, game: Packing, *chosen: Tensor) -> dict[str, Tensor]:
+        """What the agent sees of N bins; the placement agent once orientations [N] are chosen."""
+        seen: dict[str, Tensor] = self._observe(
+            game, self.cnns.planes, *chosen, afterstates=self.afterstates
+        )
+        return seen
 
     def get_latent(
         self, obs: Mapping[str, Tensor], masks: Tensor | None = None, hidden_state: None = None
-    ) -> Tensor:
-        """Features [B, C, W, D]; hands the action mask to the distribution."""
+    ) -> Features:
+        """Features of the cells; hands the action mask to the distribution."""
         self.distribution.mask = obs["mask"]
         return self.cnns.keep(obs)
 
@@ -94,8 +111,8 @@ class Critic(MLPModel):
 
     def get_latent(
         self, obs: Mapping[str, Tensor], masks: Tensor | None = None, hidden_state: None = None
-    ) -> Tensor:
-        """Features [B, C, W, D]."""
+    ) -> Features:
+        """Features of the cells."""
         return self._features(obs)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.agents.trunk import Network, pooled_head
 from marl_pack.bins import ORIENTATIONS, utilization
 from marl_pack.packing import Packing
@@ -18,18 +19,22 @@ from marl_pack.stability.windows import rest_and_waste
 WAYS = len(ORIENTATIONS)
 
 
-def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
+def observe(
+    game: Packing, planes: Sequence[str] = (), afterstates: AfterstateCritic | None = None
+) -> dict[str, Tensor]:
     """What the agent sees of N bins.
 
     Args:
         game: the bins.
         planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`), for all orientations.
+        afterstates: who says what placements are worth, for the plane ``worth``.
 
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its own sides w, d, h),
         ``height`` int16 [N, 1], ``mask`` bool [N, 6], and what the planes need: ``cells`` bool,
-        ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 6, W, D], ``best_room``
-        float32 [N, 1], ``solid`` bool [N, W, D], ``filled`` float32 [N, 1].
+        ``rest`` int16, ``waste`` int32, ``room``, ``fits`` and ``worth`` float32 [N, 6, W, D],
+        ``best_room`` and ``best_worth`` float32 [N, 1], ``solid`` bool [N, W, D], ``filled``
+        float32 [N, 1].
     """
     seen = {
         "heightmap": game.bins.heightmap.clone(),
@@ -40,7 +45,7 @@ def observe(game: Packing, planes: Sequence[str] = ()) -> dict[str, Tensor]:
     if "mask" in planes:
         seen["cells"] = game.mask
     sides = game.candidates(game.items, game.weights).sides
-    return seen | under(game, sides, planes) | ahead(game, planes)
+    return seen | under(game, sides, planes) | ahead(game, planes, afterstates)
 
 
 def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tensor]:
@@ -56,19 +61,31 @@ def under(game: Packing, sides: Tensor, planes: Sequence[str]) -> dict[str, Tens
 
 
 def ahead(
-    game: Packing, planes: Sequence[str], orientation: Tensor | None = None
+    game: Packing,
+    planes: Sequence[str],
+    afterstates: AfterstateCritic | None,
+    orientation: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """What the planes ``room`` and ``fits`` need if asked for: all ways, or the one chosen [N]."""
-    wanted = [name for name in ("room", "fits") if name in planes]
-    if not wanted:
-        return {}
-    made = dict(zip(("room", "fits"), game.room(), strict=True))
-    best = made["room"].flatten(1).amax(1, keepdim=True)
+    """What the planes need that show what placements leave: of all ways, or the one chosen [N].
+
+    Raises:
+        ValueError: if ``worth`` is asked for and nobody can say it.
+    """
+    made: dict[str, Tensor] = {}
+    if "room" in planes or "fits" in planes:
+        made = dict(zip(("room", "fits"), game.room(), strict=True))
+        made["best_room"] = made["room"].flatten(1).amax(1, keepdim=True)
+    if "worth" in planes:
+        if afterstates is None:
+            raise ValueError("the plane worth needs a critic of afterstates")
+        made["worth"] = afterstates.worth(game)
     if orientation is not None:
         rows = torch.arange(game.n, device=game.device)
-        made = {name: values[rows, orientation][:, None] for name, values in made.items()}
-    found = {name: made[name] for name in wanted}
-    return found | {"best_room": best} if "room" in wanted else found
+        for name in made.keys() & {"room", "fits", "worth"}:
+            made[name] = made[name][rows, orientation][:, None]
+    if "worth" in planes:
+        made["best_worth"] = made["worth"].flatten(1).amax(1, keepdim=True)
+    return {name: made[name] for name in made if name.removeprefix("best_") in planes}
 
 
 def make_head(network: Network) -> nn.Module:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from marl_pack.agents.afterstate import AfterstateCritic
 from marl_pack.agents.orientation import ahead, under
 from marl_pack.agents.trunk import Network, ScoreMap
 from marl_pack.packing import Packing
@@ -22,6 +23,7 @@ def observe(
     planes: Sequence[str],
     orientation: Tensor,
     heightmap: Tensor | None = None,
+    afterstates: AfterstateCritic | None = None,
 ) -> dict[str, Tensor]:
     """What the agent sees of N bins once the orientations are chosen.
 
@@ -30,12 +32,14 @@ def observe(
         planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`).
         orientation: int64 [N].
         heightmap: a copy of the game's that is at hand, to save making another.
+        afterstates: who says what placements are worth, for the plane ``worth``.
 
     Returns:
         ``heightmap`` int16 [N, W, D] (a copy), ``item`` int16 [N, 3] (its sides along x, y, z),
         ``height`` int16 [N, 1], ``mask`` bool [N, W · D], and what the planes need: ``cells``
-        bool, ``rest`` int16, ``waste`` int32, ``room`` and ``fits`` float32 [N, 1, W, D],
-        ``best_room`` float32 [N, 1], ``solid`` bool [N, W, D], ``filled`` float32 [N, 1].
+        bool, ``rest`` int16, ``waste`` int32, ``room``, ``fits`` and ``worth`` float32
+        [N, 1, W, D], ``best_room`` and ``best_worth`` float32 [N, 1], ``solid`` bool [N, W, D],
+        ``filled`` float32 [N, 1].
     """
     oriented = game.orient(orientation)
     seen = {
@@ -47,7 +51,7 @@ def observe(
     if "mask" in planes:
         seen["cells"] = oriented.mask[:, None]
     found = under(game, oriented.sides[:, None], planes)
-    return seen | found | ahead(game, planes, orientation)
+    return seen | found | ahead(game, planes, afterstates, orientation)
 
 
 def make_head(network: Network) -> nn.Module:

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack.agents import orientation, placement
 from marl_pack.agents.checkpoint import load_actor, load_critic
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import Choice
@@ -175,14 +174,11 @@ class Planner:
         probable = [torch.zeros(0, ways, cells, dtype=torch.float64, device=game.device)]
         for some in torch.split(which, max(1, AT_ONCE // (ways * cells))):
             each = game.branch(some)
-            first = self._probabilities(
-                "orientation", orientation.observe(each, self.orientation_agent.cnns.planes)
-            )  # [b, 6]
+            first = self._probabilities("orientation", self.orientation_agent.see(each))  # [b, 6]
             second = self._probabilities(
                 "placement",
-                placement.observe(
+                self.placement_agent.see(
                     each.branch(torch.arange(len(some)).repeat_interleave(ways)),
-                    self.placement_agent.cnns.planes,
                     every.repeat(len(some)),
                 ),
             )  # [b · 6, W · D]
@@ -222,13 +218,13 @@ class Planner:
                 return value
             if len(goes_on) < game.n:
                 rows, game = rows[goes_on], game.branch(goes_on)
-            seen = orientation.observe(game, self.orientation_agent.cnns.planes)
+            seen = self.orientation_agent.see(game)
             if steps == self.plan.depth:
                 assert self.critic is not None
                 value[rows] += self.critic(seen).squeeze(1).double()
                 return value
             turned = self.orientation_agent(seen).squeeze(1).long()
-            seen = placement.observe(game, self.placement_agent.cnns.planes, turned)
+            seen = self.placement_agent.see(game, turned)
             choice = turned, self.placement_agent(seen).squeeze(1).long()
 
 

@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents import checkpoint, joint
+from marl_pack.agents.afterstate import AfterstateLearner
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import OrientationAgent, PlacementAgent
 from marl_pack.agents.symmetry import see_through_symmetries
@@ -37,6 +38,7 @@ class PackingPPO:
         env: the bins.
         schedules: name → settings of :meth:`anneal` for that learner.
         iterations: how many there will be, for the schedules.
+        afterstates: who teaches the critic that says what placements are worth, if agents see it.
     """
 
     rnd = None  # no exploration bonus; the runner asks
@@ -49,6 +51,7 @@ class PackingPPO:
         env: PackingVecEnv,
         schedules: Mapping[str, Mapping[str, Any]],
         iterations: int,
+        afterstates: AfterstateLearner | None = None,
     ) -> None:
         if not learners:
             raise ValueError("both agents are frozen: nothing would learn")
@@ -58,6 +61,8 @@ class PackingPPO:
         self.schedules = schedules
         self.iterations = iterations
         self.iteration = 0
+        self.afterstates = afterstates
+        self._last: TensorDict | None = None  # what is seen after the rollout
 
     # --- the rollout ------------------------------------------------------------------------------
 
@@ -67,6 +72,12 @@ class PackingPPO:
         Args:
             obs: what the environment's ``get_observations`` gave.
         """
+        chosen = self._choose(obs)
+        if self.afterstates is not None:
+            self.afterstates.record(self.env.game, chosen[:, 0], chosen[:, 1])
+        return chosen
+
+    def _choose(self, obs: TensorDict) -> Tensor:
         if "joint" in self.learners:
             pair = self.learners["joint"].act(obs).squeeze(1).long()
             return torch.stack(joint.split(pair, obs["heightmap"][0].numel()), 1)
@@ -94,6 +105,7 @@ class PackingPPO:
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Advantages of the rollout that ends at ``obs``; there an orientation is drawn."""
+        self._last = obs
         for name, ppo in self.learners.items():
             if name != "placement":
                 ppo.compute_returns(obs)
@@ -112,9 +124,12 @@ class PackingPPO:
 
         Returns:
             For each learner ``name/value``, ``name/surrogate``, ``name/entropy`` (means over the
-            minibatches), ``name/kl`` (old to new policy, after the update), ``name/learning_rate``.
+            minibatches), ``name/kl`` (old to new policy, after the update), ``name/learning_rate``;
+            and ``afterstates``, the squared error of what placements were thought worth.
         """
         losses: dict[str, float] = {}
+        if self.afterstates is not None:
+            losses["afterstates"] = self._learn_afterstates(self.afterstates)
         for name, ppo in self.learners.items():
             self.anneal(name)
             if self.schedules[name]["symmetry"]:
@@ -123,7 +138,18 @@ class PackingPPO:
             losses[f"{name}/kl"] = self._divergence(ppo)
             losses[f"{name}/learning_rate"] = ppo.learning_rate
         self.iteration += 1
+        if self.afterstates is not None:
+            assert self._last is not None
+            self.env.look_again(self._last)
         return losses
+
+    def _learn_afterstates(self, learner: AfterstateLearner) -> float:
+        """Teach the critic of afterstates what the first learner's placements have brought."""
+        name, ppo = next(iter(self.learners.items()))
+        self.anneal(name)
+        processes = ppo.gpu_world_size if ppo.is_multi_gpu else 1
+        storage = ppo.storage
+        return learner.learn(storage.returns, storage.rewards, ppo.learning_rate, processes)
 
     def anneal(self, name: str) -> None:
         """Set learning rate and entropy bonus as this iteration's share of the run says."""
@@ -181,10 +207,13 @@ class PackingPPO:
 
     def save(self) -> dict[str, Any]:
         """Stock states of the learners' PPOs, by name, and the place in the schedules."""
-        return {
+        kept: dict[str, Any] = {
             "learners": {name: ppo.save() for name, ppo in self.learners.items()},
             "schedule_iteration": self.iteration,
         }
+        if self.afterstates is not None:
+            kept["afterstates"] = self.afterstates.optimizer.state_dict()
+        return kept
 
     def load(
         self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool
@@ -194,6 +223,9 @@ class PackingPPO:
         for name, ppo in self.learners.items():
             wanted = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
         self.iteration = loaded_dict["schedule_iteration"]
+        if self.afterstates is not None:
+            self.afterstates.optimizer.load_state_dict(loaded_dict["afterstates"])
+            self.env.game.forget(self.afterstates.critic)
         return wanted
 
     @staticmethod
@@ -227,7 +259,15 @@ class PackingPPO:
         if "placement" in frozen:
             placement_agent = checkpoint.placement_agent({"agents": frozen}, device, None)
         iterations = cfg["algorithm"]["iterations"]
-        return PackingPPO(learners, orientation_agent, placement_agent, env, schedules, iterations)
+        afterstates = None
+        if env.afterstates is not None:
+            first = next(iter(learners.values()))
+            afterstates = AfterstateLearner(
+                env.afterstates, cfg["num_steps_per_env"], env.num_envs, first.learning_rate
+            )
+        return PackingPPO(
+            learners, orientation_agent, placement_agent, env, schedules, iterations, afterstates
+        )
 
 
 def _stock_ppo(
@@ -255,4 +295,7 @@ def _stock_ppo(
     }
     alone = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
-        return PPO.construct_algorithm(obs, alone, agent_cfg, device)
+        ppo: PPO = PPO.construct_algorithm(obs, alone, agent_cfg, device)
+    if env.afterstates is not None:  # one for both agents; rsl_rl would copy what it is given
+        ppo.actor.afterstates = env.afterstates
+    return ppo

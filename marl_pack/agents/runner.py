@@ -237,6 +237,8 @@ class Runner(OnPolicyRunner):
         logger = {name: getattr(self.logger, name) for name in LOGGER_STATE}
         logger |= {name: list(getattr(self.logger, name)) for name in LOGGER_BUFFERS}
         kept = {"game": self.env.game.state_dict(), "random": random, "logger": logger}
+        if self.alg.afterstates is not None:
+            kept["afterstates"] = self.alg.afterstates.state_dict()
         on_cpu: dict[str, Any] = tree_map(
             lambda value: value.cpu() if torch.is_tensor(value) else value, kept
         )
@@ -289,7 +291,11 @@ class Runner(OnPolicyRunner):
                 )
             for part in ("actor", "critic"):
                 weights = widen(agent[f"{part}_state_dict"], theirs, mine, AGENTS[name].WAYS)
-                getattr(ppo, part).load_state_dict(weights)
+                # A critic of afterstates that there was not begins fresh.
+                getattr(ppo, part).load_state_dict(
+                    {**{k: v for k, v in getattr(ppo, part).state_dict().items()
+                        if k.startswith("afterstates.")}, **weights}
+                )  # fmt: skip
 
     def resume(self, found: Mapping[str, Any]) -> None:
         """Go on exactly from the checkpoint of a run with the same settings.
@@ -315,6 +321,8 @@ class Runner(OnPolicyRunner):
         self.evaluations = list(found["evaluations"])
         own = states[self.gpu_global_rank]
         self.env.game.load_state_dict(own["game"])
+        if self.alg.afterstates is not None:
+            self.alg.afterstates.load_state_dict(own["afterstates"])
         for name in LOGGER_STATE:
             value = own["logger"][name]
             setattr(self.logger, name, value.to(self.device) if torch.is_tensor(value) else value)

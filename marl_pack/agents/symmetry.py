@@ -23,6 +23,7 @@ MAPS = (
     "waste",
     "room",
     "fits",
+    "worth",
 )  # observations [B, A, W, D] that lie at low corners
 
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
-PLANES = ("mask", "rest", "waste", "room", "fits", "solid", "filled")
+PLANES = ("mask", "rest", "waste", "room", "fits", "worth", "solid", "filled")
 """Extra planes a network may see. For each orientation its agent has to judge: the cells where the
 item may be set down, its resting height at every cell, the space it would enclose there, and what
 each placement would leave: in how many cells the next item may be set down in the mean, and how
-probable it is that it finds a place (:mod:`marl_pack.stability.room`). Once: the columns that are
+probable it is that it finds a place (:mod:`marl_pack.stability.room`), and what a critic of what is
+left thinks it worth (:mod:`marl_pack.agents.afterstate`). Once: the columns that are
 filled to the floor, which is what ``hull_alpha`` rests on; and how much of the bin is filled, which
 where the items were cut from it says how much is still to come."""
 
@@ -35,7 +37,7 @@ class Network:
         shortcut: whether the heads see the planes themselves beside the features.
         context: whether features pooled over the whole bin are added to every cell's.
         planes: what is seen beside the paper's four channels: any of mask, rest, waste, room,
-            fits, solid, filled.
+            fits, worth, solid, filled.
         hidden: units of the hidden layer in the heads that follow pooling.
         share_trunk: whether the critic looks at the actor's features or has a trunk of its own.
     """
@@ -64,15 +66,16 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
 
     Args:
         observation: ``heightmap`` int [B, W, D], ``item`` int [B, 3], ``height`` int [B, 1] (H),
-            and for the extra planes ``cells`` bool, ``rest`` int, ``waste`` int, ``room`` float or
-            ``fits`` float [B, A, W, D], ``best_room`` float [B, 1], ``solid`` bool [B, W, D],
-            ``filled`` float [B, 1].
+            and for the extra planes ``cells`` bool, ``rest`` int, ``waste`` int, ``room``, ``fits``
+            or ``worth`` float [B, A, W, D], ``best_room`` and ``best_worth`` float [B, 1],
+            ``solid`` bool [B, W, D], ``filled`` float [B, 1].
         planes: which of :data:`PLANES`.
 
     Heights are shares of H, the item's sides shares of W, D and H, and what would be wasted is a
     share of the item's own volume, so that the planes mean the same in every bin. Room is seen
     beside the most that any placement of the item would leave: 1 for that, 0 from a fifth less on.
-    How much the most is comes as one more channel.
+    How much the most is comes as one more channel. Likewise what placements are worth, twice: 1
+    for the best of those seen, 0 from a twentieth of the bin less on, and from a two hundredth.
     """
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]
@@ -92,6 +95,11 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
             seen.append(most.log1p().expand(-1, 1, width, depth) / 4)
         elif plane == "fits":
             seen.append(observation["fits"])
+        elif plane == "worth":
+            best = observation["best_worth"][:, :, None, None]
+            behind = observation["worth"] - best
+            seen += [(1 + near * behind).clamp(min=0) for near in (20, 200)]
+            seen.append(best.expand(-1, 1, width, depth))
         elif plane == "solid":
             seen.append(observation["solid"].float()[:, None])
         elif plane == "filled":
@@ -103,7 +111,7 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
 
 def channels_of(planes: list[str], ways: int) -> list[tuple[str, int]]:
     """The channels :func:`input_planes` makes for A = ``ways`` orientations: (plane, which)."""
-    several = {"paper": 4, "solid": 1, "filled": 1, "room": ways + 1}
+    several = {"paper": 4, "solid": 1, "filled": 1, "room": ways + 1, "worth": 2 * ways + 1}
     return [(plane, k) for plane in ["paper", *planes] for k in range(several.get(plane, ways))]
 
 
@@ -124,8 +132,34 @@ def pool(features: Tensor) -> Tensor:
     return torch.cat((features.mean((2, 3)), most), 1)
 
 
+class Features:
+    """What a trunk makes of an observation: features of every cell, and the planes themselves.
+
+    Args:
+        made: float32 [B, C, W, D].
+        planes: what else the heads see, float32 [B, P, W, D]; None if nothing.
+    """
+
+    def __init__(self, made: Tensor, planes: Tensor | None) -> None:
+        self.made, self.planes = made, planes
+
+    @property
+    def whole(self) -> Tensor:
+        """Both, one after the other: [B, C + P, W, D]."""
+        return self.made if self.planes is None else torch.cat((self.made, self.planes), 1)
+
+    @cached_property
+    def pooled(self) -> Tensor:
+        """:func:`pool` of :attr:`whole`; actor and critic need it made but once."""
+        if self.planes is None:
+            return pool(self.made)
+        # Apart, as nothing is to be learned of the planes: going back through them is dear.
+        parts = (pool(values).chunk(2, 1) for values in (self.made, self.planes))
+        return torch.cat([part for both in zip(*parts, strict=True) for part in both], 1)
+
+
 class Trunk(nn.Module):
-    """Observation → features [B, C, W, D], C as :func:`count_features` says.
+    """Observation → :class:`Features`, as many as :func:`count_features` says.
 
     Args:
         ways: orientations A for which the extra planes come.
@@ -145,9 +179,9 @@ class Trunk(nn.Module):
         )
         self.context = initialized(nn.Linear(2 * channels, channels)) if network.context else None
         # (observation, its features), kept from the actor for the critic that shares this trunk.
-        self._kept: tuple[object, Tensor] | None = None
+        self._kept: tuple[object, Features] | None = None
 
-    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+    def forward(self, observation: Mapping[str, Tensor]) -> Features:
         """Features of every cell."""
         x = planes = input_planes(observation, self.planes)
         for k, convolution in enumerate(self.convolutions):
@@ -155,20 +189,20 @@ class Trunk(nn.Module):
             x = x + y if self.residual and k else y
             if k == 0 and self.context is not None:
                 x = x + self.context(pool(x))[:, :, None, None]
-        return torch.cat((x, planes), 1) if self.shortcut else x
+        return Features(x, planes if self.shortcut else None)
 
-    def keep(self, observation: Mapping[str, Tensor]) -> Tensor:
+    def keep(self, observation: Mapping[str, Tensor]) -> Features:
         """The features, kept for one :meth:`take` with the same observation."""
-        features: Tensor = self(observation)
+        features: Features = self(observation)
         self._kept = (observation, features)
         return features
 
-    def take(self, observation: Mapping[str, Tensor]) -> Tensor:
+    def take(self, observation: Mapping[str, Tensor]) -> Features:
         """The features :meth:`keep` has just made of the very same observation, else fresh ones."""
         kept, self._kept = self._kept, None
         if kept is not None and kept[0] is observation:
             return kept[1]
-        features: Tensor = self(observation)
+        features: Features = self(observation)
         return features
 
 
@@ -224,11 +258,11 @@ def pooled_head(network: Network, ways: int, outputs: int, gain: float) -> nn.Se
 
 
 class Pool(nn.Module):
-    """:func:`pool` as a layer."""
+    """:attr:`Features.pooled` as a layer."""
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Features) -> Tensor:
         """Mean and maximum over the cells, [B, 2C]."""
-        return pool(features)
+        return features.pooled
 
 
 class ScoreMap(nn.Module):
@@ -243,6 +277,6 @@ class ScoreMap(nn.Module):
         super().__init__()
         self.scores = initialized(nn.Conv2d(count_features(network, ways), ways, 1), 0.01)
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Features) -> Tensor:
         """Scores in the order of the actions: orientation, x, y."""
-        return self.scores(features).flatten(1)
+        return self.scores(features.whole).flatten(1)

@@ -1,10 +1,10 @@
 """What placements leave on floors of at most 128 cells: sets of cells as the bits of two words.
 
-Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit moved by whole numbers, and
-the corners of all windows that hold a cell of a set are that set moved and united. What makes
-``hull_alpha`` fast on maps (:mod:`marl_pack.stability.hull_cpu`) is said here of sets: level by level,
-the windows without anything higher in which each quadrant around the middle, or only each half, holds
-a bearing cell of that level. Corners whose windows reach over a row's end are left out at the end.
+Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit moved by whole numbers,
+and the corners of all windows that hold a cell of a set are that set moved and united. What makes
+``hull_alpha`` fast on maps (:mod:`marl_pack.stability.hull_cpu`) is said here of sets: level by
+level, the windows without anything higher in which each quadrant around the middle, or only each
+half, holds a bearing cell of that level. Corners whose windows reach over a row's end are left out.
 """
 
 from __future__ import annotations
@@ -157,9 +157,9 @@ def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> 
 @njit(cache=True, nogil=True)
 def judge(
     heightmap: Any, hollow: Any, sides: Any, placements: Any, lengths: Any, fitting: Any,
-    cells: Any, tallest: Any,
+    counts: Any,
 ) -> None:  # fmt: skip
-    """For each placement and each footprint of what may come, the cells where it may be set down.
+    """In how many cells each box that may come could be set down after each placement.
 
     Args:
         heightmap, hollow: int16 [N, W, D], of a floor that :func:`hold` says yes to.
@@ -167,8 +167,7 @@ def judge(
         placements: int64 [K, 4], bin, orientation and cell, legal; those of a bin in one piece.
         lengths: int64 [L], ascending.
         fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
-        cells: int64 [K], written: cells where a box may be set down, over all L³ boxes.
-        tallest: int64 [K, L, L], written: of how many lengths boxes on a footprint have a place.
+        counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
     """
     width, depth = heightmap.shape[1:]
     count, most = lengths.size, fitting.size
@@ -199,8 +198,7 @@ def judge(
             _levels(heightmap[b], hollow[b], own)
         w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
         _set_down(own, _window(depth, x, y, w, d), h, after)
-        total = 0
-        tallest[k] = 0
+        counts[k] = 0
         above[:] = uint64(0)
         for level in range(most - 1, -1, -1):
             fit = fitting[level]
@@ -244,11 +242,11 @@ def judge(
                             )  # fmt: skip
                             yes_low, yes_high = yes_low | more_low, yes_high | more_high
                         if yes_low | yes_high:
-                            total += fit * (_size(yes_low) + _size(yes_high))
-                            tallest[k, i, j] = max(tallest[k, i, j], fit)
+                            found = _size(yes_low) + _size(yes_high)
+                            for tall in range(fit):
+                                counts[k, i, j, tall] += found
             above[0] |= after[level, 1, 0]
             above[1] |= after[level, 1, 1]
-        cells[k] = total
 
 
 @njit(cache=True)
