@@ -300,7 +300,8 @@ class Packing:
         game.n, game.auto_reset = len(which), False
         game._index = torch.arange(len(which), device=self.device)
         game.bins, game.bin_height = self.bins[which], self.bin_height[which]
-        game._left, game._known = None, {what: made[which] for what, made in self._known.items()}
+        game._left = None if self._left is None else self._left.of(which)
+        game._known = {what: made[which] for what, made in self._known.items()}
         for name in ("items", "weights", "mask", "orientation_mask", "alive", "lost", "t"):
             setattr(game, name, getattr(self, name)[which])
         if stream is None:

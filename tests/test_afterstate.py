@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from marl_pack.agents import checkpoint, orientation, placement
+from marl_pack.agents import afterstate, checkpoint, orientation, placement
 from marl_pack.agents.afterstate import (
     FEATURES,
     ILLEGAL,
-    MINIBATCH,
     AfterstateCritic,
     AfterstateLearner,
     features,
@@ -107,23 +106,57 @@ def test_worth_is_seen_beside_the_best() -> None:
         orientation.observe(game, ("worth",))
 
 
-def test_the_learner_finds_what_placements_bring() -> None:
+@pytest.mark.parametrize("rollouts", [3, 64])
+def test_the_learner_finds_what_placements_bring_and_remembers(
+    rollouts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(afterstate, "REMEMBERED", rollouts * 4 * 32)
     torch.manual_seed(0)
     game, critic = Packing(32, seed=1), AfterstateCritic()
-    learner = AfterstateLearner(critic, 4, 32, 1e-3)
+    learner = AfterstateLearner(critic, 4, 32)
     policy = make_policy("random", seed=1)
-    errors = []
-    for _ in range(30):
-        rewards, wanted = torch.rand(4, 32, 1), torch.zeros(4, 32, 1)
+    errors, given = [], []
+    for _ in range(100):
+        rewards, filled = torch.rand(4, 32, 1), torch.zeros(4, 32, 1)
         for step in range(4):
             choice = policy(game)
             learner.record(game, *choice)
+            before = game.bins.filled.clone()
+            volume = game._turned(choice[0]).long().prod(1)
             game.place(*choice)
-            wanted[step, :, 0] = 1 - learner.seen[learner.rollouts % 64, step, :, 0].float()
-        errors.append(learner.learn(wanted + rewards, rewards, 1e-3))
+            filled[step, :, 0] = (before + volume) / 1000
+        errors.append(learner.learn(1 - filled + rewards, rewards, 1e-3))
+        given.append(1 - filled.squeeze(-1))
     assert errors[-1] < 0.02 * errors[0]
-    assert MINIBATCH > 128  # more than a rollout: the ones before are remembered
+    remembered = sorted(learner.wanted.flatten().tolist())
+    assert remembered == pytest.approx(sorted(torch.stack(given[-rollouts:]).flatten().tolist()))
     assert all(weight.grad is None for weight in critic.parameters())
+    learner.record(game, *policy(game))
+    with pytest.raises(ValueError, match="1 steps recorded, a rollout has 4"):
+        learner.learn(rewards, rewards, 1e-3)
+
+
+def test_a_choice_without_a_place_is_not_learned_from() -> None:
+    game = Packing(16, (4, 4, 4), sides=(1, 4), seed=2, mask_orientations=False)
+    critic = AfterstateCritic()
+    learner = AfterstateLearner(critic, 8, 16)
+    for _ in range(8):
+        o = torch.zeros(16, dtype=torch.int64)
+        c = game.mask[:, 0].flatten(1).int().argmax(1)
+        expected = game.mask[:, 0].flatten(1).any(1)
+        learner.record(game, o, c)
+        assert torch.equal(learner.legal[0, learner.step - 1], expected)
+        seen = orientation.observe(game, ("worth",), critic)
+        lost = ~game.mask.flatten(1).any(1)
+        assert (seen["best_worth"][lost] == 0).all()
+        assert (input_planes(seen, ["worth"])[:, 4:16][~game.mask.repeat(1, 2, 1, 1)] == 0).all()
+        game.place(o, c)
+    assert not learner.legal[0].all()
+    error = learner.learn(
+        torch.where(learner.legal[0], 0.0, torch.nan)[..., None].nan_to_num(1e6),
+        torch.zeros(8, 16, 1), 1e-3,
+    )  # fmt: skip
+    assert error < 1
 
 
 def test_both_agents_hear_the_one_that_learns_and_checkpoints_hold_it(tmp_path: Path) -> None:
@@ -145,11 +178,20 @@ def test_both_agents_hear_the_one_that_learns_and_checkpoints_hold_it(tmp_path: 
         assert loaded is not None
         for name, weight in critic.state_dict().items():
             assert torch.equal(loaded.state_dict()[name], weight)
+    policy = checkpoint.load_policy(found)
+    policy(Packing(2, (5, 5, 5), sides=(1, 3)))
     # A run that begins with these weights has its word; one of agents without begins with its own.
     again = make_runner(parse([*small, *planes, f"--init={tmp_path / 'run'}"])[0], None)
     assert again.env.afterstates is not None
     assert torch.equal(again.env.afterstates.layers[0].weight, critic.layers[0].weight)
+    cached = again.env.game.once(again.env.afterstates, lambda: torch.zeros(0))
+    assert not len(cached)  # nothing that the one of before has said
     fewer = [option.replace(",worth", "") for option in planes]
     make_runner(parse([*small, *fewer])[0], tmp_path / "less").train(1)
+    one = make_runner(parse([*small, fewer[0], planes[1]])[0], tmp_path / "one")
+    one.train(1)
+    mixed = checkpoint.read(tmp_path / "one")
+    assert checkpoint.load_actor(mixed, "orientation", "cpu").afterstates is None
+    assert checkpoint.load_actor(mixed, "placement", "cpu").afterstates is not None
     more = make_runner(parse([*small, *planes, f"--init={tmp_path / 'less'}"])[0], None)
     more.train(1)

@@ -19,6 +19,8 @@ GAMES = (
     {"size": (16, 12, 20), "sides": (3, 12)},
     {"size": (10, 10, 4), "items": "cut1"},
     {"com_offset": (0.3, 0.2, 0.0)},
+    {"size": (3, 40, 9), "sides": (1, 3)},
+    {"size": (64, 2, 9), "sides": (1, 2)},
     {"size": (14, 6, 6), "items": [[2, 2, 2], [13, 2, 2], [3, 4, 5]] * 4},
 )
 
@@ -121,6 +123,33 @@ def test_what_is_said_of_a_placement_is_what_it_does() -> None:
     for step in range(6):
         share = (steps.clamp(max=5) == step).float().mean(1)
         assert torch.allclose(left.surface[row, 11 + step], share)
+
+
+def test_lengths_longer_than_the_floor_have_no_place() -> None:
+    game = in_play(4, 3, size=(3, 12, 9), sides=(1, 3))
+    sides = game.candidates(game.items, game.weights).sides
+    for lengths in ((4, 5), (2, 13), (20,)):
+        known = game.bins, sides, game.mask, lengths
+        ours, theirs = left_after(*known), _left_torch(*known)
+        for counts in (ours, theirs):
+            assert not counts.counts[:, -1].any()
+        assert torch.equal(maps(ours, game)[0], maps(theirs, game)[0])
+
+
+def test_of_no_bins_there_is_nothing_left() -> None:
+    game = in_play(4, 3).branch(torch.zeros(0, dtype=torch.int64))
+    assert game.room()[0].shape == (0, 6, 10, 10)
+
+
+def test_a_branch_knows_what_is_left_already() -> None:
+    game = in_play(6, 4)
+    left = game.left()
+    which = torch.tensor([4, 1, 1])
+    branch = game.branch(which)
+    assert branch.left().counts is left.counts
+    fresh = left_after(*settings_of_left(branch))
+    for known, made in zip(maps(branch.left(), branch), maps(fresh, branch), strict=True):
+        assert torch.equal(known, made)
 
 
 def test_no_placement_no_room() -> None:

@@ -24,11 +24,13 @@ PAIRS = MOST_LENGTHS * (MOST_LENGTHS + 1) // 2
 FEATURES = 2 + PAIRS * MOST_LENGTHS + SURFACE
 """Numbers that the critic sees of an afterstate."""
 HIDDEN = 64
-REMEMBERED = 64
-"""Rollouts that it learns from, the last ones."""
-UPDATES, MINIBATCH = 32, 512
-"""Steps of its optimiser after each rollout, and afterstates in each."""
-ILLEGAL = -1.0
+REMEMBERED = 1 << 16
+"""Afterstates that it learns from, of the last rollouts."""
+PASSES, MINIBATCH = 16, 512
+"""How often it learns from an afterstate, in the mean, and from how many at once."""
+AT_ONCE = 1 << 15
+"""Afterstates judged at once, at most."""
+ILLEGAL = -1e6
 """What a placement that is not legal counts as worth: less than any that is."""
 
 
@@ -87,41 +89,43 @@ class AfterstateCritic(nn.Module):
 
     def _worth(self, game: Packing) -> Tensor:
         left = game.left()
+        rows = torch.arange(len(left.volume), device=game.device)
         with torch.no_grad():
-            value = self(features(left, game.volume))
+            value = [self(features(left, game.volume, some)) for some in torch.split(rows, AT_ONCE)]
         reward = (game.alpha * left.volume - game.beta * left.waste) / game.volume
-        return left.spread((reward + value).float(), game.mask, ILLEGAL)
+        return left.spread((reward + torch.cat(value)).float(), game.mask, ILLEGAL)
 
 
 class AfterstateLearner:
     """Fits the critic to what the placements of the last rollouts have brought.
 
-    A placement's outcome is mostly luck, so the critic learns from many: from the last
-    :data:`REMEMBERED` rollouts, which agents played that were nearly those of now.
+    A placement's outcome is mostly luck, so the critic learns from many: from about
+    :data:`REMEMBERED`, which agents played that were nearly those of now.
 
     Args:
         critic: the critic.
         steps, bins: T and N of a rollout.
-        learning_rate: of Adam, unless :meth:`learn` is told another.
     """
 
-    def __init__(
-        self, critic: AfterstateCritic, steps: int, bins: int, learning_rate: float
-    ) -> None:
+    def __init__(self, critic: AfterstateCritic, steps: int, bins: int) -> None:
         self.critic = critic
-        self.optimizer = torch.optim.Adam(critic.parameters(), learning_rate)
+        self.optimizer = torch.optim.Adam(critic.parameters())
         device = next(critic.parameters()).device
-        shape = REMEMBERED, steps, bins
+        self.kept = max(1, REMEMBERED // (steps * bins))  # rollouts
+        shape = self.kept, steps, bins
         self.seen = torch.zeros(*shape, FEATURES, dtype=torch.float16, device=device)
         self.wanted = torch.zeros(shape, device=device)
+        self.legal = torch.zeros(shape, dtype=torch.bool, device=device)
         self.rollouts, self.step = 0, 0  # recorded so far, and steps of the next one
 
     def record(self, game: Packing, orientation: Tensor, cell: Tensor) -> None:
         """Keep the afterstates of what is now set down, int64 [N] each."""
         left = game.left()
-        x, y = cell // game.size[1], cell % game.size[1]
-        rows = left.index[torch.arange(game.n, device=cell.device), orientation, x, y]
-        self.seen[self.rollouts % REMEMBERED, self.step] = features(left, game.volume, rows).half()
+        b = torch.arange(game.n, device=cell.device)
+        where = b, orientation, cell // game.size[1], cell % game.size[1]
+        place = self.rollouts % self.kept, self.step
+        self.seen[place] = features(left, game.volume, left.index[where]).half()
+        self.legal[place] = game.mask[where]  # else nothing is set down
         self.step += 1
 
     def learn(
@@ -137,17 +141,25 @@ class AfterstateLearner:
 
         Returns:
             The mean squared error.
+
+        Raises:
+            ValueError: unless a whole rollout has been recorded.
         """
+        if self.step != self.seen.shape[1]:
+            raise ValueError(f"{self.step} steps recorded, a rollout has {self.seen.shape[1]}")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
-        self.wanted[self.rollouts % REMEMBERED] = (returns - rewards).squeeze(-1)
+        self.wanted[self.rollouts % self.kept] = (returns - rewards).squeeze(-1)
         self.rollouts, self.step = self.rollouts + 1, 0
-        known = min(self.rollouts, REMEMBERED)
+        known = min(self.rollouts, self.kept)
         seen, wanted = self.seen[:known].flatten(0, 2), self.wanted[:known].flatten()
+        legal = self.legal[:known].flatten().float()
         total = torch.zeros((), device=seen.device)
-        for _ in range(UPDATES):
+        updates = -(-PASSES * returns.numel() // MINIBATCH)
+        for _ in range(updates):
             some = torch.randint(len(seen), (MINIBATCH,), device=seen.device)
-            loss = (self.critic(seen[some].float()) - wanted[some]).square().mean()
+            error = (self.critic(seen[some].float()) - wanted[some]).square()
+            loss = (error * legal[some]).sum() / legal[some].sum().clamp(min=1)
             self.optimizer.zero_grad()
             loss.backward()
             if processes > 1:
@@ -158,19 +170,16 @@ class AfterstateLearner:
             self.optimizer.step()
             total += loss.detach()
         self.optimizer.zero_grad()
-        return float(total) / UPDATES
+        return float(total) / updates
 
     def state_dict(self) -> dict[str, Any]:
         """What is remembered, to go on from."""
-        known = min(self.rollouts, REMEMBERED)
-        return {
-            "seen": self.seen[:known].clone(),
-            "wanted": self.wanted[:known].clone(),
-            "rollouts": self.rollouts,
-        }
+        known = min(self.rollouts, self.kept)
+        kept = {name: getattr(self, name)[:known].clone() for name in ("seen", "wanted", "legal")}
+        return kept | {"rollouts": self.rollouts}
 
     def load_state_dict(self, kept: Mapping[str, Any]) -> None:
         """Go on from what :meth:`state_dict` gave."""
-        known = len(kept["seen"])
-        self.seen[:known], self.wanted[:known] = kept["seen"], kept["wanted"]
+        for name in ("seen", "wanted", "legal"):
+            getattr(self, name)[: len(kept[name])] = kept[name]
         self.rollouts = kept["rollouts"]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from marl_pack.agents.afterstate import AfterstateCritic
+from marl_pack.agents.afterstate import ILLEGAL, AfterstateCritic
 from marl_pack.agents.trunk import Network, pooled_head
 from marl_pack.bins import ORIENTATIONS, utilization
 from marl_pack.packing import Packing
@@ -84,7 +84,8 @@ def ahead(
         for name in made.keys() & {"room", "fits", "worth"}:
             made[name] = made[name][rows, orientation][:, None]
     if "worth" in planes:
-        made["best_worth"] = made["worth"].flatten(1).amax(1, keepdim=True)
+        best = made["worth"].flatten(1).amax(1, keepdim=True)
+        made["best_worth"] = torch.where(best > ILLEGAL, best, 0)
     return {name: made[name] for name in made if name.removeprefix("best_") in planes}
 
 

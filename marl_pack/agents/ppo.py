@@ -128,10 +128,11 @@ class PackingPPO:
             and ``afterstates``, the squared error of what placements were thought worth.
         """
         losses: dict[str, float] = {}
+        for name in self.learners:
+            self.anneal(name)
         if self.afterstates is not None:
             losses["afterstates"] = self._learn_afterstates(self.afterstates)
         for name, ppo in self.learners.items():
-            self.anneal(name)
             if self.schedules[name]["symmetry"]:
                 see_through_symmetries(ppo, name)
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
@@ -145,8 +146,7 @@ class PackingPPO:
 
     def _learn_afterstates(self, learner: AfterstateLearner) -> float:
         """Teach the critic of afterstates what the first learner's placements have brought."""
-        name, ppo = next(iter(self.learners.items()))
-        self.anneal(name)
+        ppo = next(iter(self.learners.values()))
         processes = ppo.gpu_world_size if ppo.is_multi_gpu else 1
         storage = ppo.storage
         return learner.learn(storage.returns, storage.rewards, ppo.learning_rate, processes)
@@ -261,10 +261,7 @@ class PackingPPO:
         iterations = cfg["algorithm"]["iterations"]
         afterstates = None
         if env.afterstates is not None:
-            first = next(iter(learners.values()))
-            afterstates = AfterstateLearner(
-                env.afterstates, cfg["num_steps_per_env"], env.num_envs, first.learning_rate
-            )
+            afterstates = AfterstateLearner(env.afterstates, cfg["num_steps_per_env"], env.num_envs)
         return PackingPPO(
             learners, orientation_agent, placement_agent, env, schedules, iterations, afterstates
         )
@@ -296,6 +293,8 @@ def _stock_ppo(
     alone = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
         ppo: PPO = PPO.construct_algorithm(obs, alone, agent_cfg, device)
-    if env.afterstates is not None:  # one for both agents; rsl_rl would copy what it is given
+    if ppo.actor.afterstates is not None:
+        # One for all agents, in place of the actor's own: rsl_rl would copy what it is given. The
+        # optimiser still lists the weights of the other, which never have a gradient.
         ppo.actor.afterstates = env.afterstates
     return ppo

@@ -291,11 +291,10 @@ class Runner(OnPolicyRunner):
                 )
             for part in ("actor", "critic"):
                 weights = widen(agent[f"{part}_state_dict"], theirs, mine, AGENTS[name].WAYS)
-                # A critic of afterstates that there was not begins fresh.
-                getattr(ppo, part).load_state_dict(
-                    {**{k: v for k, v in getattr(ppo, part).state_dict().items()
-                        if k.startswith("afterstates.")}, **weights}
-                )  # fmt: skip
+                model = getattr(ppo, part)
+                own = {k: v for k, v in model.state_dict().items() if k.startswith("afterstates.")}
+                model.load_state_dict(own | weights)  # a critic that there was not begins fresh
+        self.env.game.forget(self.env.afterstates)
 
     def resume(self, found: Mapping[str, Any]) -> None:
         """Go on exactly from the checkpoint of a run with the same settings.

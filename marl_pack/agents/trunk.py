@@ -75,7 +75,8 @@ def input_planes(observation: Mapping[str, Tensor], planes: list[str]) -> Tensor
     share of the item's own volume, so that the planes mean the same in every bin. Room is seen
     beside the most that any placement of the item would leave: 1 for that, 0 from a fifth less on.
     How much the most is comes as one more channel. Likewise what placements are worth, twice: 1
-    for the best of those seen, 0 from a twentieth of the bin less on, and from a two hundredth.
+    for the best of those seen, 0 from a twentieth of the bin less on, and from a two hundredth
+    (of the reward of filling it, Eq. 5 with α = 1).
     """
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]

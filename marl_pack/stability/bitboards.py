@@ -202,7 +202,7 @@ def judge(
         above[:] = uint64(0)
         for level in range(most - 1, -1, -1):
             fit = fitting[level]
-            if fit and (after[level, 0, 0] | after[level, 0, 1]):
+            if fit and fit_w and fit_d and (after[level, 0, 0] | after[level, 0, 1]):
                 _corners(after[level, 0], depth, undecided, quarters)
                 deep[0] = above
                 for j in range(fit_d):

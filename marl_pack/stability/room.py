@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from typing import Any
@@ -46,15 +46,19 @@ def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Left:
-    """What K legal placements would leave; those that are the same may stand there once."""
+    """What K legal placements would leave. Placements that are the same may share a row."""
 
-    index: Tensor  # int64 [N, A, W, D]   row of each placement; 0 where it is not legal
+    index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere of any
     counts: Tensor  # int32 [K, L, L, L]  cells where each box could be set down: w, d, h
     surface: Tensor  # float32 [K, 17]    share of the columns on each tenth of the bin's height,
     # and of the neighbours that differ by so many tenths of it, the last by so many or more
     volume: Tensor  # int64 [K]           of the box set down, in cells
     waste: Tensor  # int64 [K]            cells that it would enclose
     filled: Tensor  # int64 [K]           cells filled in the bin with it
+
+    def of(self, which: Tensor) -> Left:
+        """The same of the bins ``which``, int64 [B]; their placements' rows stay where they are."""
+        return replace(self, index=self.index[which])
 
     def room(self) -> Tensor:
         """The mean number of cells where a box that may come could be set down, float32 [K]."""
@@ -248,7 +252,7 @@ def _left_cpu(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...])
     footprints = np.array([(w, d, lengths[0]) for w, d in product(lengths, repeat=2)], np.int16)
     threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
     small = bitboards.hold(*shape)
-    fit_at_once = AT_ONCE // (heightmap[0].size * (1 if small else len(footprints)))
+    fit_at_once = AT_ONCE // (shape[0] * shape[1] * (1 if small else len(footprints)))
     most = max(1, min(-(-count // threads), fit_at_once))
 
     def judge(start: int) -> None:
