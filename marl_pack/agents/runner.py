@@ -314,14 +314,15 @@ class Runner(OnPolicyRunner):
             )
         try:
             self.alg.load(dict(found) | {"learners": found["agents"]}, None, True)
+            if self.alg.afterstates is not None:
+                own_critic = states[self.gpu_global_rank]["afterstates"]
+                self.alg.afterstates.load_state_dict(own_critic)
         except (RuntimeError, KeyError, TypeError) as error:
             raise ValueError(f"the checkpoint does not fit its own settings: {error}") from None
         self.current_learning_iteration = found["iter"] + 1
         self.evaluations = list(found["evaluations"])
         own = states[self.gpu_global_rank]
         self.env.game.load_state_dict(own["game"])
-        if self.alg.afterstates is not None:
-            self.alg.afterstates.load_state_dict(own["afterstates"])
         for name in LOGGER_STATE:
             value = own["logger"][name]
             setattr(self.logger, name, value.to(self.device) if torch.is_tensor(value) else value)
