@@ -46,7 +46,7 @@ def main() -> None:
             rows.append(
                 [f"{size[0]}³, sides {sides[0]}-{sides[1]}", name, device,
                  f"{1e6 * time / placements:,.2f}", f"{1e6 * time / n:,.0f}",
-                 f"{masks / time:.1f}"]
+                 f"{masks / time:.2g}"]
             )  # fmt: skip
     show(
         "what each placement leaves",
