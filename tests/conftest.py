@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from marl_pack import bins as state
+from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import Bins
+from marl_pack.packing import Packing
 from marl_pack.stability import Rule, candidates
 
 torch.set_num_threads(1)
@@ -66,3 +68,12 @@ def random_maps(
 
 def boxes_of(bins: Bins, i: int) -> np.ndarray:
     return bins.boxes[i, : int(bins.count[i])].numpy()
+
+
+def in_play(n: int, steps: int, **settings: object) -> Packing:
+    """A game that random play has begun."""
+    game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]  # a game's options have many types
+    policy = make_policy("random", seed=1)
+    for _ in range(steps):
+        game.place(*policy(game))
+    return game

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import in_play
 
 from marl_pack.agents import afterstate, checkpoint, orientation, placement
 from marl_pack.agents.afterstate import (
@@ -19,14 +20,6 @@ from marl_pack.bins import place
 from marl_pack.config import parse
 from marl_pack.packing import Packing
 from marl_pack.train import make_runner
-
-
-def in_play(n: int, steps: int, **settings: object) -> Packing:
-    game = Packing(n, seed=3, **settings)  # type: ignore[arg-type]  # a game's options have many types
-    policy = make_policy("random", seed=1)
-    for _ in range(steps):
-        game.place(*policy(game))
-    return game
 
 
 def test_a_mirrored_or_turned_bin_looks_the_same_to_it() -> None:

@@ -5,6 +5,7 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 import torch
+from conftest import in_play
 
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import ORIENTATIONS
@@ -23,14 +24,6 @@ GAMES = (
     {"size": (64, 2, 9), "sides": (1, 2)},
     {"size": (14, 6, 6), "items": [[2, 2, 2], [13, 2, 2], [3, 4, 5]] * 4},
 )
-
-
-def in_play(n: int, steps: int, **settings: object) -> Packing:
-    game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]  # a game's options have many types
-    policy = make_policy("random", seed=1)
-    for _ in range(steps):
-        game.place(*policy(game))
-    return game
 
 
 def legal_cells(heights: np.ndarray, hollow: np.ndarray, box: tuple[int, ...], top: int) -> int:
