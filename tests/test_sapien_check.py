@@ -179,6 +179,18 @@ def test_judging_ends_at_the_first_fall() -> None:
     assert check(made.first(0)).stands
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_judging_only_what_hangs_together_with_the_last_box_finds_what_judging_all_does(
+    seed: int,
+) -> None:
+    made = random_stack(seed, "none")
+    for count, verdict in enumerate(judge(made), 1):
+        whole = check(made.first(count))
+        assert verdict.stands == whole.stands
+        assert verdict.moved == whole.moved
+        assert verdict.distance.shape == verdict.angle.shape == (count,)
+
+
 def test_where_all_boxes_collide_a_neighbour_props_up_what_falls() -> None:
     made = controls.propped(0.0, 100.0, -5.0).stack()
     assert not check(made).stands

@@ -1,6 +1,6 @@
 """The judge: a stack is set up in SAPIEN (PhysX on the CPU) and has to stand.
 
-After each placement all boxes are put at their nominal poses and left to gravity; the stack stands
+After each placement the boxes are put at their nominal poses and left to gravity; the stack stands
 if none moves or turns by more than a threshold in the time given. What makes the verdict one that
 can be trusted:
 
@@ -32,6 +32,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from marl_pack.sapien_check.stack import SLACK, Floats, Stack, overlaps
 
@@ -326,10 +327,28 @@ def _simulate(stack: Stack, physics: Physics, step: Pass, groups: list[list[int]
 
 
 def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
-    """The verdict after each placement, up to the first fall."""
+    """The verdict after each placement, up to the first fall.
+
+    Simulated are the boxes that hang together with the one just placed, each by its contacts with
+    the next. Nothing acts on the others that did not when they were judged: what was found of them
+    then still holds.
+
+    Raises:
+        SimulationError: as :func:`check`.
+    """
+    on = stack.rests_on()
+    distance, angle = np.zeros(len(stack)), np.zeros(len(stack))
     for count in range(1, len(stack) + 1):
-        verdict = check(stack.first(count), physics)
-        yield verdict
+        part = np.arange(count)
+        if not physics.everything:
+            _, group = connected_components(on[:count, :count], directed=False)
+            part = np.flatnonzero(group == group[-1])
+        verdict = check(stack.only(part), physics)
+        distance[part], angle[part] = verdict.distance, verdict.angle
+        yield replace(
+            verdict, distance=distance[:count].copy(), angle=angle[:count].copy(),
+            moved=tuple(part[list(verdict.moved)].tolist()),
+        )  # fmt: skip
         if not verdict.stands:
             return
 

@@ -110,7 +110,11 @@ class Stack:
         """The stack as it was when ``count`` boxes had been placed."""
         if not 0 <= count <= len(self):
             raise ValueError(f"count = {count}: needs 0 … {len(self)}")
-        arrays = {f.name: getattr(self, f.name)[:count] for f in fields(self) if f.name != "size"}
+        return self.only(slice(count))
+
+    def only(self, which: slice | NDArray[np.intp]) -> Stack:
+        """These boxes of the stack alone, in the order given."""
+        arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
     def rests_on(self) -> NDArray[np.bool_]:
