@@ -336,7 +336,9 @@ def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
     Raises:
         SimulationError: as :func:`check`.
     """
-    on = stack.rests_on()
+    if not len(stack):
+        return
+    on = stack.scaled(LONGEST / float(stack.sides.max())).rests_on()  # as check sees it
     distance, angle = np.zeros(len(stack)), np.zeros(len(stack))
     for count in range(1, len(stack) + 1):
         part = np.arange(count)
