@@ -74,6 +74,8 @@ class Agent:
         policy: who plays a frozen agent: random, dblf, height_min, best_fit, most_room, for the
             orientation agent also first (as the item comes), or a run's folder or checkpoint.
         network: shape of its network.
+        imitate: whose choices it learns at first, as for policy; null for nobody's.
+        imitate_iterations: for how many iterations.
         learning_rate: the agent's own, in place of ppo.learning_rate; null for that.
         entropy_coef: the agent's own, in place of ppo.entropy_coef; null for that.
         final_entropy_coef: the agent's own, in place of ppo.final_entropy_coef; null for that.
@@ -82,6 +84,8 @@ class Agent:
     frozen: bool = False
     policy: str | None = None
     network: Network = field(default_factory=Network)
+    imitate: str | None = None
+    imitate_iterations: int = 0
     learning_rate: float | None = None
     entropy_coef: float | None = None
     final_entropy_coef: float | None = None
@@ -420,6 +424,14 @@ def check(config: Config) -> None:
             refuse(f"{name}.policy", agent.policy, f"goes with {name}.frozen: true")
         if (agent.frozen or agent.policy) and config.joint:
             refuse(f"{name}.frozen", "true", "the joint agent cannot be frozen in part")
+        check_imitation(name, agent)
+        if agent.imitate and config.joint:
+            refuse(f"{name}.imitate", agent.imitate, "the joint agent imitates nobody")
+        if agent.imitate and ppo.normalize_advantage_per_mini_batch:
+            refuse(
+                f"{name}.imitate", agent.imitate,
+                "needs ppo.normalize_advantage_per_mini_batch: false",
+            )  # fmt: skip
     if config.orientation.frozen and config.placement.frozen:
         refuse("placement.frozen", "true", "both agents are frozen, so nothing would learn")
     game = config.game
@@ -433,6 +445,21 @@ def check(config: Config) -> None:
         refuse("ppo.symmetry", "true", "items whose centre of mass is off centre do not mirror")
     if ppo.symmetry and {o ^ 1 for o in game.orientations} != set(game.orientations):
         refuse("ppo.symmetry", "true", "game.orientations needs the pairs 0 1, 2 3 and 4 5 whole")
+
+
+def check_imitation(name: str, agent: Agent) -> None:
+    """Refuse an imitation without a model, an end or a learner.
+
+    Raises:
+        ConfigError: naming the key and what would be right.
+    """
+    given, iterations = f"{name}.imitate = {agent.imitate}", agent.imitate_iterations
+    if iterations < 0 or (agent.imitate is not None and iterations == 0):
+        raise ConfigError(f"{name}.imitate_iterations = {iterations}: needs 1 or more")
+    if agent.imitate is None and iterations > 0:
+        raise ConfigError(f"{name}.imitate_iterations = {iterations}: goes with {name}.imitate")
+    if agent.imitate is not None and agent.frozen:
+        raise ConfigError(f"{given}: a frozen agent does not learn")
 
 
 def _own(agent: Agent) -> tuple[float | None, ...]:

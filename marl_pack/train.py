@@ -99,7 +99,8 @@ def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> d
 
     Args:
         config: the settings.
-        found: the checkpoint of the run to go on with: it holds the frozen agents.
+        found: the checkpoint of the run to go on with: it holds the frozen agents, and those that
+            are imitated.
     """
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
@@ -117,6 +118,13 @@ def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> d
                 else (found["agents"][name])
             )
             return {"frozen": kept}
+        imitated = None
+        if own.imitate is not None:
+            imitated = (
+                checkpoint.frozen_agent(own.imitate, name)
+                if found is None
+                else found["agents"][name].get("imitated")  # no longer, once it has learned enough
+            )
         rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
         entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
         last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef
@@ -124,6 +132,8 @@ def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> d
             "network": asdict(own.network),
             "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
             "symmetry": symmetry,
+            "imitated": imitated,
+            "imitate_iterations": own.imitate_iterations,
             "schedule": {
                 "schedule": schedule, "learning_rate": rate, "entropy_coef": entropy,
                 "final_entropy_coef": entropy if last is None else last,

@@ -96,6 +96,15 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.frozen=true", "--placement.policy=dblf", "--orientation.frozen=true",
       "--orientation.policy=random"], r"both agents are frozen"),
     (["--joint=true", "--placement.frozen=true", "--placement.policy=dblf"], r"cannot be frozen"),
+    (["--placement.imitate=dblf"], r"placement\.imitate_iterations = 0: needs 1 or more"),
+    (["--placement.imitate_iterations=-1"], r"imitate_iterations = -1: needs 1 or more"),
+    (["--placement.imitate_iterations=5"], r"= 5: goes with placement\.imitate"),
+    (["--orientation.imitate=first", "--orientation.imitate_iterations=5",
+      "--orientation.frozen=true", "--orientation.policy=dblf"], r"a frozen agent does not learn"),
+    (["--placement.imitate=dblf", "--placement.imitate_iterations=5", "--joint=true"],
+     r"imitates nobody"),
+    (["--placement.imitate=dblf", "--placement.imitate_iterations=5",
+      "--ppo.normalize_advantage_per_mini_batch=true"], r"per_mini_batch: false"),
     (["--placement.network.layers=0"], r"layers = 0"),
     (["--ppo.symmetry=true", "--game.com_offset=[0.1,0,0]"], r"ppo\.symmetry.*off centre"),
     (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
@@ -149,6 +158,8 @@ def test_a_broken_file_is_named_with_the_line(
     (["--game.orientations=[7]"], "orientations"),
     (["--game.rule=lbcp", "--game.thresholds=paper"], "thresholds"),
     (["--orientation.frozen=true", "--orientation.policy=nobody"], "'nobody' is neither one of"),
+    (["--placement.imitate=nobody", "--placement.imitate_iterations=5"], "'nobody' is neither"),
+    (["--placement.imitate=first", "--placement.imitate_iterations=5"], "'first': one of dblf"),
 ])  # fmt: skip
 def test_what_only_the_game_can_refuse_is_told_as_plainly(
     options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -236,6 +236,67 @@ def test_a_run_with_a_frozen_network_goes_on_without_the_old_file(tmp_path: Path
     assert same(weights_kept, found["agents"]["placement"]["actor_state_dict"])
 
 
+def test_an_agent_that_imitates_plays_as_its_model_and_then_as_it_has_learned() -> None:
+    config = tiny("--orientation.imitate=dblf", "--orientation.imitate_iterations=25",
+                  "--placement.imitate=dblf", "--placement.imitate_iterations=20",
+                  "--ppo.learning_rate=0.005")  # fmt: skip
+    runner = make_runner(config, None)
+    dblf = checkpoint.find_policy("dblf")
+    game, alg = runner.env.game, runner.alg
+
+    def played_alike() -> list[float]:
+        """The share of equal orientations and, where the same is chosen, of equal cells."""
+        share = []
+        with torch.inference_mode():
+            for _ in range(20):
+                mine = alg.act(runner.env.get_observations())
+                cell = checkpoint.find_placement_agent("dblf")(game, mine[:, 0])
+                share.append(torch.stack((mine[:, 0] == dblf(game)[0], mine[:, 1] == cell), 1))
+        return torch.cat(share).float().mean(0).tolist()
+
+    assert all(0.85 < share < 1 for share in played_alike())  # one in ten is at random
+    before = agreement(runner, dblf)
+    runner.train(20)
+    assert agreement(runner, dblf) > before + 0.2
+    orientation, cell = played_alike()
+    assert orientation > 0.85  # that agent still imitates
+    assert cell < 0.8
+    assert alg.learners["placement"].storage.advantages.unique().tolist() == [1.0]
+    runner.train(26)
+    assert alg.imitated("orientation") is None
+    for ppo in alg.learners.values():
+        assert len(ppo.storage.advantages.unique()) > 10
+
+
+def agreement(runner: Runner, model: Policy) -> float:
+    """How often the networks' best orientation is the model's, where there are several."""
+    game = make_game(tiny(), 200, 7, auto_reset=True, device="cpu")
+    learned = checkpoint.load_policy(runner.checkpoint())
+    same = []
+    for _ in range(5):
+        several = game.orientation_mask.sum(1) > 1
+        same.append((learned(game)[0] == model(game)[0])[several].float())
+        game.place(*model(game))
+    return float(torch.cat(same).mean())
+
+
+def test_a_run_that_imitates_a_network_goes_on_without_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "first.pt"
+    checkpoint.write(path, make_runner(tiny(), None).checkpoint())
+    config = tiny("--placement.imitate=" + str(path), "--placement.imitate_iterations=3")
+    whole = make_runner(config, None)
+    whole.train(5)
+    part = make_runner(config, tmp_path / "run")
+    part.train(2)
+    path.unlink()
+    found = checkpoint.read(tmp_path / "run" / "latest.pt")
+    resumed = make_runner(config, None, found)
+    resumed.train(5)
+    assert same(weights(whole, "placement"), weights(resumed, "placement"))
+    assert "imitated" in found["agents"]["placement"]
+    assert "imitated" not in resumed.checkpoint()["agents"]["placement"]
+
+
 @pytest.mark.parametrize("joint", [False, True])
 def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
     """Else the KL that the adaptive schedule sees is huge, and the learning rate collapses."""
@@ -290,6 +351,7 @@ def test_a_critic_with_a_trunk_of_its_own_and_symmetry_learn_too() -> None:
     (), ("--joint=true",), ("--orientation.frozen=true", "--orientation.policy=random"),
     ("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--game.items=cut2"),
     ("--orientation.network.planes=[mask,worth]", "--placement.network.planes=[worth,room]"),
+    ("--orientation.imitate=random", "--orientation.imitate_iterations=4"),
 ])  # fmt: skip
 def test_a_resumed_run_gives_the_weights_of_one_never_stopped(
     options: tuple[str, ...], tmp_path: Path

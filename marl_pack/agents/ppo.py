@@ -2,14 +2,16 @@
 
 Within a step the orientation agent acts on what it sees, then the placement agent on what that
 choice shows it. Both store the same reward and the same end of episode (Eq. 3 – 5), each reckons
-its advantages over its own turns. A frozen agent plays without learning.
+its advantages over its own turns. A frozen agent plays without learning. One that imitates plays as
+another does, one choice in ten at random, and learns to play so: all have the same advantage.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,9 +25,29 @@ from marl_pack.agents.afterstate import AfterstateLearner
 from marl_pack.agents.model import Actor, Critic
 from marl_pack.agents.policy import OrientationAgent, PlacementAgent
 from marl_pack.agents.symmetry import see_through_symmetries
+from marl_pack.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
+RANDOM_SHARE = 0.1  # of the choices of an agent that imitates, so that it does not grow too sure
 KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """Whom a learner imitates for how many iterations.
+
+    Orientation agents both, or placement agents.
+    """
+
+    model: Callable[..., Tensor]
+    random: Callable[..., Tensor]
+    iterations: int
+
+    def __call__(self, game: Packing, *before: Tensor) -> Tensor:
+        """The model's choices, int64 [N], or random ones in their place here and there."""
+        chosen = self.model(game, *before)
+        other = torch.rand(len(chosen), device=chosen.device) < RANDOM_SHARE
+        return torch.where(other, self.random(game, *before), chosen)
 
 
 class PackingPPO:
@@ -39,6 +61,7 @@ class PackingPPO:
         schedules: name → settings of :meth:`anneal` for that learner.
         iterations: how many there will be, for the schedules.
         afterstates: who teaches the critic that says what placements are worth, if agents see it.
+        imitations: name → whom that learner imitates at first; nobody where there is none.
     """
 
     rnd = None  # no exploration bonus; the runner asks
@@ -52,6 +75,7 @@ class PackingPPO:
         schedules: Mapping[str, Mapping[str, Any]],
         iterations: int,
         afterstates: AfterstateLearner | None = None,
+        imitations: Mapping[str, Imitation] | None = None,
     ) -> None:
         if not learners:
             raise ValueError("both agents are frozen: nothing would learn")
@@ -62,6 +86,7 @@ class PackingPPO:
         self.iterations = iterations
         self.iteration = 0
         self.afterstates = afterstates
+        self.imitations = dict(imitations or {})
         self._last: TensorDict | None = None  # what is seen after the rollout
 
     # --- the rollout ------------------------------------------------------------------------------
@@ -82,15 +107,33 @@ class PackingPPO:
             pair = self.learners["joint"].act(obs).squeeze(1).long()
             return torch.stack(joint.split(pair, obs["heightmap"][0].numel()), 1)
         if "orientation" in self.learners:
-            orientation = self.learners["orientation"].act(obs).squeeze(1).long()
+            orientation = self._turn("orientation", obs)
         else:
             orientation = self._frozen_orientation()
         if "placement" in self.learners:
-            cell = self.learners["placement"].act(self.env.orient(orientation)).squeeze(1).long()
+            cell = self._turn("placement", self.env.orient(orientation), orientation)
         else:
             assert self.placement_agent is not None
             cell = self.placement_agent(self.env.game, orientation)
         return torch.stack((orientation, cell), 1)
+
+    def _turn(self, name: str, seen: TensorDict, *before: Tensor) -> Tensor:
+        """A learner's choice, int64 [N], or that of whom it imitates, recorded as its own."""
+        ppo = self.learners[name]
+        action = ppo.act(seen)
+        imitated = self.imitated(name)
+        if imitated is None:
+            return action.squeeze(1).long()
+        chosen = imitated(self.env.game, *before)
+        taken = chosen.unsqueeze(1).to(action.dtype)
+        ppo.transition.actions = taken
+        ppo.transition.actions_log_prob = ppo.actor.get_output_log_prob(taken).detach()
+        return chosen
+
+    def imitated(self, name: str) -> Imitation | None:
+        """Whom the learner imitates in this iteration."""
+        imitation = self.imitations.get(name)
+        return imitation if imitation and self.iteration < imitation.iterations else None
 
     def _frozen_orientation(self) -> Tensor:
         assert self.orientation_agent is not None
@@ -110,12 +153,18 @@ class PackingPPO:
             if name != "placement":
                 ppo.compute_returns(obs)
                 continue
-            if "orientation" in self.learners:
+            imitated = self.imitated("orientation")
+            if imitated is not None:
+                orientation = imitated(self.env.game)
+            elif "orientation" in self.learners:
                 actor = self.learners["orientation"].actor
                 orientation = actor(obs, stochastic_output=True).squeeze(1).long()
             else:
                 orientation = self._frozen_orientation()
             ppo.compute_returns(self.env.orient(orientation))
+        for name, ppo in self.learners.items():
+            if self.imitated(name) is not None:
+                ppo.storage.advantages = torch.ones_like(ppo.storage.advantages)
 
     # --- the update -------------------------------------------------------------------------------
 
@@ -239,11 +288,16 @@ class PackingPPO:
             env: the bins.
             cfg: ``algorithm`` with ``iterations``; ``agents``: for each agent either ``frozen``
                 (what a checkpoint keeps of it) or ``network``, ``algorithm`` (rsl_rl's PPO),
-                ``schedule`` and ``symmetry``.
+                ``schedule``, ``symmetry`` and, if it imitates, ``imitated`` (as ``frozen``) and
+                ``imitate_iterations``.
             device: of the networks.
         """
+        rebuild: dict[str, Callable[..., Any]] = {
+            "orientation": checkpoint.orientation_agent, "placement": checkpoint.placement_agent,
+        }  # fmt: skip
         learners, schedules = {}, {}
         frozen: dict[str, Any] = {}
+        imitations = {}
         for name, settings in cfg["agents"].items():
             if settings.get("frozen"):
                 frozen[name] = settings["frozen"]
@@ -253,18 +307,25 @@ class PackingPPO:
                 seen = env.orient(torch.zeros(env.num_envs, dtype=torch.int64, device=env.device))
             learners[name] = _stock_ppo(name, settings, seen, env, cfg, device)
             schedules[name] = {**settings["schedule"], "symmetry": settings["symmetry"]}
+            if settings.get("imitated"):
+                model, random = (
+                    rebuild[name]({"agents": {name: kept}}, device, None)
+                    for kept in (settings["imitated"], {"name": "random"})
+                )
+                imitations[name] = Imitation(model, random, settings["imitate_iterations"])
         orientation_agent = placement_agent = None
         if "orientation" in frozen:
-            orientation_agent = checkpoint.orientation_agent({"agents": frozen}, device, None)
+            orientation_agent = rebuild["orientation"]({"agents": frozen}, device, None)
         if "placement" in frozen:
-            placement_agent = checkpoint.placement_agent({"agents": frozen}, device, None)
+            placement_agent = rebuild["placement"]({"agents": frozen}, device, None)
         iterations = cfg["algorithm"]["iterations"]
         afterstates = None
         if env.afterstates is not None:
             afterstates = AfterstateLearner(env.afterstates, cfg["num_steps_per_env"], env.num_envs)
         return PackingPPO(
-            learners, orientation_agent, placement_agent, env, schedules, iterations, afterstates
-        )
+            learners, orientation_agent, placement_agent, env, schedules, iterations, afterstates,
+            imitations,
+        )  # fmt: skip
 
 
 def _stock_ppo(

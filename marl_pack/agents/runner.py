@@ -217,6 +217,9 @@ class Runner(OnPolicyRunner):
             name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
             for name, state in algorithm.pop("learners").items()
         }
+        for name in learned:
+            if self.alg.imitated(name) is not None:  # to go on without the old file
+                learned[name]["imitated"] = self.cfg["agents"][name]["imitated"]
         return {
             "format": checkpoint.FORMAT,
             "marl_pack": marl_pack.__version__,
