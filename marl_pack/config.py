@@ -454,9 +454,9 @@ def check_imitation(name: str, agent: Agent) -> None:
         ConfigError: naming the key and what would be right.
     """
     given, iterations = f"{name}.imitate = {agent.imitate}", agent.imitate_iterations
-    if iterations < 0 or (agent.imitate is not None and iterations == 0):
+    if agent.imitate is not None and iterations < 1:
         raise ConfigError(f"{name}.imitate_iterations = {iterations}: needs 1 or more")
-    if agent.imitate is None and iterations > 0:
+    if agent.imitate is None and iterations != 0:
         raise ConfigError(f"{name}.imitate_iterations = {iterations}: goes with {name}.imitate")
     if agent.imitate is not None and agent.frozen:
         raise ConfigError(f"{given}: a frozen agent does not learn")

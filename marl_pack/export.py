@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     console.print(f"{name}: was frozen, has no critic that rsl_rl could load")
                     continue
                 path = folder / f"{name}.pt"
-                checkpoint.write(path, agent)
+                checkpoint.write(path, {k: v for k, v in agent.items() if k != "imitated"})
                 console.print(f"{path}: for rsl_rl's PPO.load", soft_wrap=True)
                 continue
             path = folder / f"{name}.onnx"

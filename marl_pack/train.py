@@ -109,22 +109,21 @@ def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> d
     schedule = ppo.pop("schedule")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
+    def other(name: str, key: str, source: str) -> dict[str, Any]:
+        """What is kept of an agent that another run, or a rule, plays."""
+        try:
+            return checkpoint.frozen_agent(source, name)
+        except (ValueError, FileNotFoundError) as error:
+            raise ConfigError(f"{name}.{key}: {error}") from None
+
     def agent(name: str, own: Agent) -> dict[str, Any]:
+        held = None if found is None else found["agents"][name]
         if own.frozen:
             assert own.policy is not None, "the settings were checked"
-            kept = (
-                checkpoint.frozen_agent(own.policy, name)
-                if found is None
-                else (found["agents"][name])
-            )
-            return {"frozen": kept}
+            return {"frozen": other(name, "policy", own.policy) if held is None else held}
         imitated = None
-        if own.imitate is not None:
-            imitated = (
-                checkpoint.frozen_agent(own.imitate, name)
-                if found is None
-                else found["agents"][name].get("imitated")  # no longer, once it has learned enough
-            )
+        if own.imitate is not None:  # what it has learned enough from is not held any more
+            imitated = other(name, "imitate", own.imitate) if held is None else held.get("imitated")
         rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
         entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
         last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef

@@ -97,7 +97,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
       "--orientation.policy=random"], r"both agents are frozen"),
     (["--joint=true", "--placement.frozen=true", "--placement.policy=dblf"], r"cannot be frozen"),
     (["--placement.imitate=dblf"], r"placement\.imitate_iterations = 0: needs 1 or more"),
-    (["--placement.imitate_iterations=-1"], r"imitate_iterations = -1: needs 1 or more"),
+    (["--placement.imitate_iterations=-1"], r"imitate_iterations = -1: goes with placement"),
     (["--placement.imitate_iterations=5"], r"= 5: goes with placement\.imitate"),
     (["--orientation.imitate=first", "--orientation.imitate_iterations=5",
       "--orientation.frozen=true", "--orientation.policy=dblf"], r"a frozen agent does not learn"),
@@ -157,9 +157,12 @@ def test_a_broken_file_is_named_with_the_line(
     (["--game.items=nowhere.npz"], "nowhere.npz"),
     (["--game.orientations=[7]"], "orientations"),
     (["--game.rule=lbcp", "--game.thresholds=paper"], "thresholds"),
-    (["--orientation.frozen=true", "--orientation.policy=nobody"], "'nobody' is neither one of"),
-    (["--placement.imitate=nobody", "--placement.imitate_iterations=5"], "'nobody' is neither"),
-    (["--placement.imitate=first", "--placement.imitate_iterations=5"], "'first': one of dblf"),
+    (["--orientation.frozen=true", "--orientation.policy=nobody"],
+     "orientation.policy: 'nobody' is neither one of"),
+    (["--placement.imitate=nobody", "--placement.imitate_iterations=5"],
+     "placement.imitate: 'nobody' is neither one of dblf"),
+    (["--placement.imitate=first", "--placement.imitate_iterations=5"],
+     "placement.imitate: 'first' is neither one of dblf"),
 ])  # fmt: skip
 def test_what_only_the_game_can_refuse_is_told_as_plainly(
     options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -70,7 +70,8 @@ def test_the_command_writes_every_learned_agent(
     options = ["--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
                "--ppo.max_iterations=1", "--evaluation.every=0", f"--output.folder={tmp_path}",
                "--output.name=run", "--orientation.frozen=true", "--orientation.policy=first",
-               "--placement.network.planes=[worth]"]  # fmt: skip
+               "--placement.network.planes=[worth]", "--placement.imitate=dblf",
+               "--placement.imitate_iterations=5"]  # fmt: skip
     assert train(options) == 0
     assert main([str(tmp_path / "run")]) == 0
     assert "orientation: played by first" in capsys.readouterr().out
@@ -79,7 +80,7 @@ def test_the_command_writes_every_learned_agent(
     assert main([str(tmp_path / "run"), "--format", "rsl_rl", "--folder", str(tmp_path / "o")]) == 0
     state = torch.load(tmp_path / "o" / "placement.pt", weights_only=True)
     found = checkpoint.read(tmp_path / "run")
-    assert state.keys() == found["agents"]["placement"].keys()
+    assert state.keys() == found["agents"]["placement"].keys() - {"imitated"}
     with pytest.raises(SystemExit):
         main([str(tmp_path / "nowhere")])
     assert "no such checkpoint" in capsys.readouterr().err

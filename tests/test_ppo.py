@@ -236,54 +236,110 @@ def test_a_run_with_a_frozen_network_goes_on_without_the_old_file(tmp_path: Path
     assert same(weights_kept, found["agents"]["placement"]["actor_state_dict"])
 
 
-def test_an_agent_that_imitates_plays_as_its_model_and_then_as_it_has_learned() -> None:
-    config = tiny("--orientation.imitate=dblf", "--orientation.imitate_iterations=25",
-                  "--placement.imitate=dblf", "--placement.imitate_iterations=20",
-                  "--ppo.learning_rate=0.005")  # fmt: skip
-    runner = make_runner(config, None)
+IMITATES = (
+    "--orientation.imitate=dblf", "--orientation.imitate_iterations=25",
+    "--placement.imitate=dblf", "--placement.imitate_iterations=20",
+)  # fmt: skip
+
+
+def test_what_an_agent_imitates_is_recorded_as_its_own_and_counts_as_a_success() -> None:
+    runner = make_runner(tiny(*IMITATES, "--ppo.num_envs=256"), None)
+    env, alg = runner.env, runner.alg
+    obs = env.get_observations()
+    orients, places = (
+        checkpoint.find_orientation_agent("dblf"), checkpoint.find_placement_agent("dblf")
+    )  # fmt: skip
+    as_the_model = []
+    with torch.inference_mode():
+        for step in range(4):
+            model = orients(env.game)
+            actions = alg.act(obs)
+            cell = places(env.game, actions[:, 0])
+            as_the_model.append(actions == torch.stack((model, cell), 1))
+            for name, taken in zip(("orientation", "placement"), actions.T, strict=True):
+                transition = alg.learners[name].transition
+                assert torch.equal(transition.actions.squeeze(1).long(), taken), (name, step)
+            obs, *rest = env.step(actions)
+            alg.process_env_step(obs, *rest)
+        alike = torch.cat(as_the_model).float().mean(0)
+        assert ((alike > 0.88) & (alike < 0.98)).all()  # one in ten is drawn, at times the same
+        seen = {}
+        placement = alg.learners["placement"]
+        stock = placement.compute_returns
+        placement.compute_returns = lambda last: (seen.update(last.items()), stock(last))
+        before = {"items": env.game.items.clone()}
+        model = orients(env.game)
+        alg.compute_returns(obs)
+        turned = before["items"].gather(1, torch.tensor(ORIENTATIONS)[model])
+        assert (turned == seen["item"]).all(1).float().mean() > 0.88
+        for ppo in alg.learners.values():
+            storage = ppo.storage
+            assert (storage.advantages == 1).all()
+            assert (storage.returns - storage.values).std() > 0.01  # what the critic learns
+            ppo.actor(storage.observations[3], stochastic_output=True)
+            ours = ppo.actor.get_output_log_prob(storage.actions[3])
+            assert torch.allclose(ours, storage.actions_log_prob[3].squeeze(1), atol=1e-5)
+
+
+def test_an_agent_learns_to_play_as_its_model_and_then_on_its_own() -> None:
+    runner = make_runner(tiny(*IMITATES, "--ppo.learning_rate=0.005"), None)
     dblf = checkpoint.find_policy("dblf")
-    game, alg = runner.env.game, runner.alg
-
-    def played_alike() -> list[float]:
-        """The share of equal orientations and, where the same is chosen, of equal cells."""
-        share = []
-        with torch.inference_mode():
-            for _ in range(20):
-                mine = alg.act(runner.env.get_observations())
-                cell = checkpoint.find_placement_agent("dblf")(game, mine[:, 0])
-                share.append(torch.stack((mine[:, 0] == dblf(game)[0], mine[:, 1] == cell), 1))
-        return torch.cat(share).float().mean(0).tolist()
-
-    assert all(0.85 < share < 1 for share in played_alike())  # one in ten is at random
     before = agreement(runner, dblf)
     runner.train(20)
-    assert agreement(runner, dblf) > before + 0.2
-    orientation, cell = played_alike()
-    assert orientation > 0.85  # that agent still imitates
-    assert cell < 0.8
-    assert alg.learners["placement"].storage.advantages.unique().tolist() == [1.0]
+    orientation, cell = agreement(runner, dblf)
+    assert orientation > before[0] + 0.2
+    assert cell > before[1] + 0.4
+    runner.train(22)
+    orientation, placement = (runner.alg.learners[n].storage for n in ("orientation", "placement"))
+    assert (orientation.advantages == 1).all()
+    assert len(placement.advantages.unique()) > 10
     runner.train(26)
-    assert alg.imitated("orientation") is None
-    for ppo in alg.learners.values():
-        assert len(ppo.storage.advantages.unique()) > 10
+    assert len(orientation.advantages.unique()) > 10
 
 
-def agreement(runner: Runner, model: Policy) -> float:
-    """How often the networks' best orientation is the model's, where there are several."""
+def agreement(runner: Runner, model: Policy) -> tuple[float, float]:
+    """How often the networks choose the model's orientation, and then its cell, of several."""
     game = make_game(tiny(), 200, 7, auto_reset=True, device="cpu")
-    learned = checkpoint.load_policy(runner.checkpoint())
-    same = []
+    found = runner.checkpoint()
+    orients, places = (
+        checkpoint.orientation_agent(found, "cpu"), checkpoint.placement_agent(found, "cpu")
+    )  # fmt: skip
+    turned, put = [], []
     for _ in range(5):
+        orientation, cell = model(game)
         several = game.orientation_mask.sum(1) > 1
-        same.append((learned(game)[0] == model(game)[0])[several].float())
-        game.place(*model(game))
-    return float(torch.cat(same).mean())
+        turned.append((orients(game) == orientation)[several])
+        several = game.orient(orientation).mask.flatten(1).sum(1) > 1
+        put.append((places(game, orientation) == cell)[several])
+        game.place(orientation, cell)
+    return tuple(float(torch.cat(same).float().mean()) for same in (turned, put))
+
+
+def test_where_orientations_are_not_masked_none_that_is_lost_is_drawn_to_imitate() -> None:
+    config = tiny("--orientation.imitate=dblf", "--orientation.imitate_iterations=9",
+                  "--game.mask_orientations=false")  # fmt: skip
+    runner = make_runner(config, None)
+    env = runner.env
+    obs = env.get_observations()
+    with torch.inference_mode():
+        for _ in range(60):
+            actions = runner.alg.act(obs)
+            cells = env.game.mask[torch.arange(16), actions[:, 0]].flatten(1)
+            assert cells.any(1).all()
+            obs, *_ = env.step(actions)
 
 
 def test_a_run_that_imitates_a_network_goes_on_without_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "first.pt"
-    checkpoint.write(path, make_runner(tiny(), None).checkpoint())
+    other = tiny("--seed=7", "--placement.network.planes=[mask,worth]",
+                 "--placement.network.channels=4")  # fmt: skip
+    checkpoint.write(path, make_runner(other, None).checkpoint())
     config = tiny("--placement.imitate=" + str(path), "--placement.imitate_iterations=3")
+    whole = make_runner(config, None)
+    model = checkpoint.find_placement_agent(str(path))
+    with torch.inference_mode():
+        actions = whole.alg.act(whole.env.get_observations())
+    assert (actions[:, 1] == model(whole.env.game, actions[:, 0])).float().mean() > 0.5
     whole = make_runner(config, None)
     whole.train(5)
     part = make_runner(config, tmp_path / "run")
@@ -292,7 +348,8 @@ def test_a_run_that_imitates_a_network_goes_on_without_the_old_file(tmp_path: Pa
     found = checkpoint.read(tmp_path / "run" / "latest.pt")
     resumed = make_runner(config, None, found)
     resumed.train(5)
-    assert same(weights(whole, "placement"), weights(resumed, "placement"))
+    for name in ("orientation", "placement"):
+        assert same(weights(whole, name), weights(resumed, name))
     assert "imitated" in found["agents"]["placement"]
     assert "imitated" not in resumed.checkpoint()["agents"]["placement"]
 

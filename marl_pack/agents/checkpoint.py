@@ -6,7 +6,8 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
 - ``config``: the run's resolved settings;
 - ``agents``: for each agent its ``network`` (fields of :class:`marl_pack.agents.trunk.Network`) and
   weights as rsl_rl's ``PPO.save()`` gives them (``actor_state_dict``, ``critic_state_dict``,
-  ``optimizer_state_dict``), or the ``name`` of the rule that plays a frozen one;
+  ``optimizer_state_dict``), or the ``name`` of the rule that plays a frozen one; while it
+  imitates, ``imitated`` too: whom, as is kept of a frozen agent;
 - ``iter``, ``items``, ``seconds``, ``evaluations``: how far the run was and what it had reached;
 - ``state``: in a run's latest checkpoint only, what resuming needs.
 """
@@ -298,10 +299,14 @@ def frozen_agent(source: str, name: str) -> dict[str, Any]:
     Args:
         source: a rule's name, a run's folder or a checkpoint.
         name: ``orientation`` or ``placement``.
+
+    Raises:
+        ValueError, FileNotFoundError: if it is none of these.
     """
-    if source in ORIENTATION_AGENTS:
+    rules = ORIENTATION_AGENTS if name == "orientation" else POLICIES
+    if source in rules:
         return {"name": source}
-    found = read(_path(source, ORIENTATION_AGENTS))
+    found = read(_path(source, rules))
     agent = found["agents"].get(name)
     if agent is None:
         raise ValueError(f"{source}: has no {name} agent; it has: {', '.join(found['agents'])}")

@@ -22,13 +22,18 @@ from torch import Tensor
 
 from marl_pack.agents import checkpoint, joint
 from marl_pack.agents.afterstate import AfterstateLearner
+from marl_pack.agents.heuristics import make_placement_agent
 from marl_pack.agents.model import Actor, Critic
-from marl_pack.agents.policy import OrientationAgent, PlacementAgent
+from marl_pack.agents.policy import OrientationAgent, PlacementAgent, draw
 from marl_pack.agents.symmetry import see_through_symmetries
-from marl_pack.packing import Packing
+from marl_pack.packing import Packing, orientations_with_a_cell
 from marl_pack.vec_env import PackingVecEnv
 
 RANDOM_SHARE = 0.1  # of the choices of an agent that imitates, so that it does not grow too sure
+RANDOM: Mapping[str, Callable[..., Tensor]] = {
+    "orientation": lambda game: draw(orientations_with_a_cell(game.mask)),
+    "placement": make_placement_agent("random", None),
+}
 KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
 
 
@@ -308,11 +313,8 @@ class PackingPPO:
             learners[name] = _stock_ppo(name, settings, seen, env, cfg, device)
             schedules[name] = {**settings["schedule"], "symmetry": settings["symmetry"]}
             if settings.get("imitated"):
-                model, random = (
-                    rebuild[name]({"agents": {name: kept}}, device, None)
-                    for kept in (settings["imitated"], {"name": "random"})
-                )
-                imitations[name] = Imitation(model, random, settings["imitate_iterations"])
+                model = rebuild[name]({"agents": {name: settings["imitated"]}}, device, None)
+                imitations[name] = Imitation(model, RANDOM[name], settings["imitate_iterations"])
         orientation_agent = placement_agent = None
         if "orientation" in frozen:
             orientation_agent = rebuild["orientation"]({"agents": frozen}, device, None)
