@@ -424,14 +424,7 @@ def check(config: Config) -> None:
             refuse(f"{name}.policy", agent.policy, f"goes with {name}.frozen: true")
         if (agent.frozen or agent.policy) and config.joint:
             refuse(f"{name}.frozen", "true", "the joint agent cannot be frozen in part")
-        check_imitation(name, agent)
-        if agent.imitate and config.joint:
-            refuse(f"{name}.imitate", agent.imitate, "the joint agent imitates nobody")
-        if agent.imitate and ppo.normalize_advantage_per_mini_batch:
-            refuse(
-                f"{name}.imitate", agent.imitate,
-                "needs ppo.normalize_advantage_per_mini_batch: false",
-            )  # fmt: skip
+        check_imitation(name, agent, config)
     if config.orientation.frozen and config.placement.frozen:
         refuse("placement.frozen", "true", "both agents are frozen, so nothing would learn")
     game = config.game
@@ -447,19 +440,26 @@ def check(config: Config) -> None:
         refuse("ppo.symmetry", "true", "game.orientations needs the pairs 0 1, 2 3 and 4 5 whole")
 
 
-def check_imitation(name: str, agent: Agent) -> None:
-    """Refuse an imitation without a model, an end or a learner.
+def check_imitation(name: str, agent: Agent, config: Config) -> None:
+    """Refuse an imitation without a model, an end or a learner that could.
 
     Raises:
         ConfigError: naming the key and what would be right.
     """
-    given, iterations = f"{name}.imitate = {agent.imitate}", agent.imitate_iterations
-    if agent.imitate is not None and iterations < 1:
-        raise ConfigError(f"{name}.imitate_iterations = {iterations}: needs 1 or more")
-    if agent.imitate is None and iterations != 0:
-        raise ConfigError(f"{name}.imitate_iterations = {iterations}: goes with {name}.imitate")
-    if agent.imitate is not None and agent.frozen:
+    given, span = f"{name}.imitate = {agent.imitate}", f"{name}.imitate_iterations"
+    iterations = agent.imitate_iterations
+    if agent.imitate is None:
+        if iterations != 0:
+            raise ConfigError(f"{span} = {iterations}: goes with {name}.imitate")
+        return
+    if iterations < 1:
+        raise ConfigError(f"{span} = {iterations}: needs 1 or more")
+    if agent.frozen:
         raise ConfigError(f"{given}: a frozen agent does not learn")
+    if config.joint:
+        raise ConfigError(f"{given}: the joint agent imitates nobody")
+    if config.ppo.normalize_advantage_per_mini_batch:
+        raise ConfigError(f"{given}: needs ppo.normalize_advantage_per_mini_batch: false")
 
 
 def _own(agent: Agent) -> tuple[float | None, ...]:
