@@ -13,12 +13,12 @@ import torch
 
 from benchmarks.planning import spread
 from benchmarks.timing import show
-from marl_pack.agents import checkpoint
-from marl_pack.agents.afterstate import AfterstateCritic
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.learning import checkpoint
 from marl_pack.agents.policy import Choice, Policy
 from marl_pack.config import Config, from_dict
 from marl_pack.evaluate import play
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.train import make_game
 
 

@@ -14,7 +14,7 @@ import torch
 from benchmarks.timing import devices, show
 from marl_pack import env_aec
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 OTHERS = (
     ("Zhao 2021 (1 orientation)", 1413),

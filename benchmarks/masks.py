@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.states import LARGE, SMALL, in_play, random_items
 from benchmarks.timing import best_time, devices, show
-from marl_pack.stability import RULES, Candidates, candidates, hull_alpha, hull_cpu, make_rule
+from marl_pack.stability import RULES, OrientedItem, hull_alpha, hull_cpu, make_rule, orient_item
 from marl_pack.stability.reference import corners
 
 
@@ -70,7 +70,7 @@ def against_the_literal_reading(states: int = 32) -> None:
     seconds = dict.fromkeys(("literal", "mask", "kernel", "levels"), 0.0)
     for b in range(states):
         one = torch.tensor([b])
-        bins, item = game.bins[one], Candidates(items[one][:, None])
+        bins, item = game.bins[one], OrientedItem(items[one][:, None])
         sides_b = tuple(items[b].tolist())
         inputs = (heights[b], gaps[b], sides_b, size[2])
         exact = literal_algorithm_1(*inputs, squares=True)
@@ -107,7 +107,7 @@ def batched(n: int = 1024) -> None:
     rows = []
     for device in devices():
         game = in_play(n, SMALL, device=device)
-        item = game.candidates(game.items, game.weights)
+        item = game.orient_item(game.items, game.weights)
         for name in RULES:
             rule = make_rule(name)
             seconds = best_time(
@@ -126,7 +126,7 @@ def scaling() -> None:
         place = ((side, side, side), (side // 5, side // 2))
         n = max(8, 4096 * 100 // side**2)
         game = in_play(n, place, steps=20)
-        item = candidates(game.items)
+        item = orient_item(game.items)
         seconds = best_time(lambda g=game, i=item: hull_alpha(g.bins, i), 5)  # type: ignore[misc]  # bound now
         each = seconds / (6 * n)
         rows.append([f"{side} × {side}", f"{1e6 * each:.3f}", f"{1e9 * each / side**2:.2f}"])

@@ -17,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.timing import show
-from marl_pack.agents import checkpoint
-from marl_pack.agents.planning import Plan, make_planner
+from marl_pack.agents.learning import checkpoint
 from marl_pack.agents.policy import Policy
+from marl_pack.agents.search import Plan, make_planner
 from marl_pack.evaluate import interval, play
+from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
-from marl_pack.packing import Packing
 
 PLANS = (
     "rollouts=16,top=4,depth=1",

@@ -12,10 +12,10 @@ from unittest import mock
 import torch
 
 from benchmarks.timing import best_time, devices, show
+from marl_pack.agents.afterstates import bitboards
+from marl_pack.agents.afterstates.afterstates import _left_torch, afterstates_of, probe_lengths
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.packing import Packing
-from marl_pack.stability import bitboards
-from marl_pack.stability.room import _left_torch, left_after, probe_lengths
+from marl_pack.game.packing import Packing
 
 
 def main() -> None:
@@ -27,20 +27,23 @@ def main() -> None:
         policy = make_policy("random", seed=1)
         for _ in range(6):
             game.place(*policy(game))
-        boxes = game.candidates(game.items, game.weights).sides
+        boxes = game.orient_item(game.items, game.weights).sides
         lengths = probe_lengths(*game.stream.sides)
-        placements = len(left_after(game.bins, boxes, game.mask, lengths).counts)
+        placements = len(afterstates_of(game.bins, boxes, game.mask, lengths).counts)
 
         def seconds(code: object, device: str, game: Packing = game) -> float:
-            known = game.bins.to(device), game.candidates(game.items, game.weights).sides.to(device)
+            known = (
+                game.bins.to(device),
+                game.orient_item(game.items, game.weights).sides.to(device),
+            )
             mask, reach = game.mask.to(device), probe_lengths(*game.stream.sides)
             return best_time(lambda: code(*known, mask, reach), 5, device)  # type: ignore[operator]  # either code
 
         with mock.patch.object(bitboards, "hold", return_value=False):
-            masks = seconds(left_after, "cpu")
+            masks = seconds(afterstates_of, "cpu")
         ways = [("compiled masks", "cpu", masks)]
         if bitboards.hold(*size[:2]):
-            ways.insert(0, ("sets of bits", "cpu", seconds(left_after, "cpu")))
+            ways.insert(0, ("sets of bits", "cpu", seconds(afterstates_of, "cpu")))
         ways += [("tensor code", device, seconds(_left_torch, device)) for device in devices()]
         for name, device, time in ways:
             rows.append(

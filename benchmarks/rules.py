@@ -15,7 +15,7 @@ import torch
 from benchmarks.states import LARGE, SMALL
 from benchmarks.timing import show
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.stability import RULES, make_rule
 
 
@@ -31,7 +31,7 @@ def compare(
     seconds = dict.fromkeys(RULES, 0.0)
     programs = between = 0
     for _ in range(steps):
-        item = game.candidates(game.items, game.weights)
+        item = game.orient_item(game.items, game.weights)
         masks = {}
         for name, rule in rules.items():
             start = time.process_time()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 SMALL = ((10, 10, 10), (2, 5))
 """Bin and sides of the published data sets."""

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from benchmarks.timing import devices, show
-from marl_pack.agents.runner import Runner
+from marl_pack.agents.learning.runner import Runner
 from marl_pack.config import parse
 from marl_pack.train import make_runner
 

@@ -19,11 +19,11 @@ from scipy import stats
 
 from benchmarks.timing import show
 from marl_pack import evaluate
-from marl_pack.agents import checkpoint
 from marl_pack.agents.heuristics import POLICIES
+from marl_pack.agents.learning import checkpoint
 from marl_pack.bins import Size
+from marl_pack.game.packing import Packing
 from marl_pack.items import Stream, choose_stream
-from marl_pack.packing import Packing
 
 GROUPS = 8
 

@@ -20,10 +20,10 @@ from typing import Any, Literal
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
-from marl_pack.agents.trunk import Network
+from marl_pack.agents.networks.trunk import Network
 from marl_pack.bins import check_size
+from marl_pack.game.packing import ALL_ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES
-from marl_pack.packing import ALL_ORIENTATIONS
 
 
 @dataclass

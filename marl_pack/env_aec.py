@@ -3,7 +3,7 @@
 A conveyor shows one box at a time. ``orientation_0`` turns it, then ``placement_0`` sets it into
 the bin, for good. Both share the reward. Masks hold exactly the actions after which nothing falls
 (Zhou et al. 2024, Algorithms 1 and 2). This module shows one bin of
-:class:`marl_pack.packing.Packing`; no rule of the game stands here.
+:class:`marl_pack.game.packing.Packing`; no rule of the game stands here.
 
 | | |
 |---|---|
@@ -55,10 +55,10 @@ from pettingzoo.utils.conversions import (
 )
 
 from marl_pack.bins import ORIENTATIONS
+from marl_pack.game.packing import ALL_ORIENTATIONS, MOST_SKIPPED, Packing
 from marl_pack.items import DEFAULT_SIDES, Stream, check_items
-from marl_pack.packing import ALL_ORIENTATIONS, MOST_SKIPPED, Packing
 from marl_pack.stability import Rule
-from marl_pack.stability.candidates import NO_OFFSET
+from marl_pack.stability.oriented_item import NO_OFFSET
 
 ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
 AGENTS = [ORIENTATION, PLACEMENT]
@@ -429,7 +429,9 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return "\n".join([self._title(), f"item {sides}", *rows]) + "\n"
 
     def _picture(self) -> NDArray[np.uint8]:
-        from marl_pack.render import draw  # matplotlib is slow to import, and not always needed
+        from marl_pack.render.picture import (
+            draw,  # matplotlib is slow to import, and not always needed
+        )
 
         sides = self._sides(turned=True)
         chosen = range(len(ORIENTATIONS)) if self._chosen is None else [self._chosen]

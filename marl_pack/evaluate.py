@@ -28,10 +28,10 @@ from scipy import stats
 from marl_pack.agents.policy import Policy
 from marl_pack.bins import Size
 from marl_pack.files import check_writable, write_atomically, write_json
+from marl_pack.game.packing import Packing
 from marl_pack.options import EPILOG, add_options, choose
-from marl_pack.packing import Packing
+from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import SimulationError, judge_all, load_sapien
-from marl_pack.sapien_check.packings import Bodies
 from marl_pack.stability import in_equilibrium
 
 BATCH = 1024  # bins played at once, at most

@@ -19,9 +19,9 @@ import torch
 from rich.console import Console
 from torch import Tensor, nn
 
-from marl_pack.agents import checkpoint
-from marl_pack.agents.afterstate import FEATURES, AfterstateCritic
-from marl_pack.agents.model import AGENTS, Actor
+from marl_pack.agents.afterstates.critic import FEATURES, AfterstateCritic
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.networks.actor_critic import AGENTS, Actor
 from marl_pack.files import write_atomically
 
 OPSET = 18
@@ -132,7 +132,7 @@ def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
     """Write the critic of afterstates: ``features`` float32 [K, F] → ``value`` float32 [K].
 
     What a placement is worth is its reward and this value of
-    :func:`marl_pack.agents.afterstate.features`.
+    :func:`marl_pack.agents.afterstates.critic.features`.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

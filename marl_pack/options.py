@@ -15,6 +15,7 @@ from rich.console import Console
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES, make_policy
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import Size, check_device
+from marl_pack.game.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.items import (
     DEFAULT_SIDES,
     GENERATED,
@@ -23,9 +24,8 @@ from marl_pack.items import (
     independent,
     make_stream,
 )
-from marl_pack.packing import ALL_ORIENTATIONS, Packing
 from marl_pack.stability import RULES
-from marl_pack.stability.candidates import NO_OFFSET
+from marl_pack.stability.oriented_item import NO_OFFSET
 
 EPILOG = (
     "The game is the one that the first checkpoint among the policies was trained on, else RS in a "
@@ -168,7 +168,7 @@ def choose_policies(
     if all(name in POLICIES for name in names) and pair == (None, None):
         return {n: make_policy(n, arguments.seed, arguments.device) for n in names}, {}
     # Only learned agents need rsl_rl.
-    from marl_pack.agents import checkpoint
+    from marl_pack.agents.learning import checkpoint
 
     how = arguments.device, arguments.seed, arguments.symmetric
     policies = {name: checkpoint.find_policy(name, *how) for name in names}
@@ -197,8 +197,8 @@ def with_plans(
     Raises:
         ValueError: if the plan cannot be read, or there is no checkpoint to plan with.
     """
-    from marl_pack.agents import checkpoint
-    from marl_pack.agents.planning import Plan, make_planner
+    from marl_pack.agents.learning import checkpoint
+    from marl_pack.agents.search import Plan, make_planner
 
     plan = Plan.parse(arguments.plan)
     if all(name in POLICIES for name in policies) or arguments.orientation is not None:

@@ -76,7 +76,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
     from matplotlib.image import imsave
 
-    from marl_pack.render import draw
+    from marl_pack.render.picture import draw
 
     bins = game.bins.to("cpu")
     count = int(bins.count)

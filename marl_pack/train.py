@@ -36,13 +36,18 @@ from rich.text import Text
 
 import marl_pack
 from marl_pack import evaluate
-from marl_pack.agents import checkpoint
-from marl_pack.agents.runner import Progress, RunInterruptedError, Runner, TrainingDivergedError
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.runner import (
+    Progress,
+    RunInterruptedError,
+    Runner,
+    TrainingDivergedError,
+)
 from marl_pack.bins import check_device
 from marl_pack.config import Agent, Config, ConfigError, from_dict, parse
 from marl_pack.files import write_atomically
+from marl_pack.game.packing import Packing
 from marl_pack.items import Stream, choose_stream
-from marl_pack.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
 PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
@@ -95,7 +100,7 @@ def make_game(
 
 
 def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """What :class:`marl_pack.agents.runner.Runner` takes, from the settings.
+    """What :class:`marl_pack.agents.learning.runner.Runner` takes, from the settings.
 
     Args:
         config: the settings.
@@ -151,7 +156,7 @@ def runner_settings(config: Config, found: Mapping[str, Any] | None = None) -> d
         "check_for_nan": True,
         "logger": logger,
         "algorithm": {
-            "class_name": "marl_pack.agents.ppo:PackingPPO", "iterations": iterations,
+            "class_name": "marl_pack.agents.learning.ppo:PackingPPO", "iterations": iterations,
         },
         "agents": {name: agent(name, own) for name, own in agents.items()},
         "latest_every": config.output.latest_every,

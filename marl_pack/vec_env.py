@@ -15,8 +15,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstate import AfterstateCritic
-from marl_pack.packing import Packing
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.game.packing import Packing
 
 
 class PackingVecEnv(VecEnv):
@@ -24,7 +24,8 @@ class PackingVecEnv(VecEnv):
 
     Args:
         game: N bins.
-        planes: extra planes for each agent (:data:`marl_pack.agents.trunk.PLANES`), by its name.
+        planes: extra planes for each agent (:data:`marl_pack.agents.networks.trunk.PLANES`), by its
+        name.
             With the key ``joint``, the first turn is the joint agent's and there is no second.
         cfg: the run's settings, for the logger: an object with ``to_dict``.
 

@@ -8,8 +8,8 @@ import torch
 from marl_pack import bins as state
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import Bins
-from marl_pack.packing import Packing
-from marl_pack.stability import Rule, candidates
+from marl_pack.game.packing import Packing
+from marl_pack.stability import Rule, orient_item
 
 torch.set_num_threads(1)
 
@@ -42,7 +42,7 @@ def random_play(
     bins = state.empty(n, size, max_boxes=steps)
     for _ in range(steps):
         items = torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
-        allowed = rule(bins, candidates(items))[:, 0].flatten(1)
+        allowed = rule(bins, orient_item(items))[:, 0].flatten(1)
         cell = torch.multinomial(
             allowed.float() + ~allowed.any(1, keepdim=True), 1, generator=generator
         )

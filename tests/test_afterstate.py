@@ -6,8 +6,9 @@ import pytest
 import torch
 from conftest import in_play
 
-from marl_pack.agents import afterstate, checkpoint, orientation, placement
-from marl_pack.agents.afterstate import (
+from marl_pack.agents import orientation, placement
+from marl_pack.agents.afterstates import critic as afterstate
+from marl_pack.agents.afterstates.critic import (
     FEATURES,
     ILLEGAL,
     AfterstateCritic,
@@ -15,10 +16,11 @@ from marl_pack.agents.afterstate import (
     features,
 )
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.trunk import input_planes
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.networks.trunk import input_planes
 from marl_pack.bins import place
 from marl_pack.config import parse
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.train import make_runner
 
 
@@ -60,7 +62,7 @@ def test_worth_is_reward_and_value_of_what_is_left() -> None:
     assert (worth[~game.mask] == ILLEGAL).all()
     for b, o, x, y in game.mask.nonzero()[::40].tolist():
         bins = game.bins[torch.tensor([b])]
-        sides = game.candidates(game.items, game.weights).sides[b, o][None]
+        sides = game.orient_item(game.items, game.weights).sides[b, o][None]
         _, waste, volume = place(bins, sides, torch.tensor([x * 10 + y]), game.weights[[b]], None)
         row = game.left().index[b, o, x, y][None]
         with torch.no_grad():

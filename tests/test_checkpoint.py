@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from marl_pack.agents import checkpoint
+from marl_pack.agents.learning import checkpoint
 from marl_pack.agents.policy import in_turns
 from marl_pack.evaluate import main as evaluate
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.train import main as train
 
 

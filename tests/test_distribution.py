@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from marl_pack.agents.distribution import MaskedCategorical
+from marl_pack.agents.networks.distribution import MaskedCategorical
 
 
 def made(logits: list[list[float]], mask: list[list[bool]]) -> MaskedCategorical:

@@ -22,7 +22,7 @@ from pettingzoo.utils import wrappers
 
 from marl_pack import env_aec
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 O, P = "orientation_0", "placement_0"  # noqa: E741  # the two agents
 

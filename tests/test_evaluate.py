@@ -9,7 +9,7 @@ from marl_pack import evaluate, train
 from marl_pack import play as play_command
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.evaluate import Episodes, load_stacks, strict_equilibrium, summary
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 
 def test_the_table_the_json_and_the_stacks_agree(

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from marl_pack.agents import checkpoint
-from marl_pack.agents.afterstate import AfterstateCritic, features
-from marl_pack.agents.model import make_actor
-from marl_pack.agents.trunk import PLANES
+from marl_pack.agents.afterstates.critic import AfterstateCritic, features
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.networks.actor_critic import make_actor
+from marl_pack.agents.networks.trunk import PLANES
 from marl_pack.export import Exported, export_afterstates, export_onnx, main
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 onnxruntime = pytest.importorskip("onnxruntime")
 

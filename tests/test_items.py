@@ -6,10 +6,10 @@ import pytest
 import torch
 from scipy import stats
 
+from marl_pack.game.packing import Packing
 from marl_pack.items import Uniform, check_items, cut, independent, load, make_stream
-from marl_pack.items.counting import below, episode_keys, mix
+from marl_pack.items.random_numbers import below, episode_keys, mix
 from marl_pack.items.streams import _uniform_items
-from marl_pack.packing import Packing
 
 BIN = (10, 10, 10)
 

@@ -9,12 +9,13 @@ import torch
 import yaml
 
 from marl_pack import config
-from marl_pack.agents import checkpoint, planning
+from marl_pack.agents import search
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.model import Actor
-from marl_pack.agents.symmetry import mean_probabilities
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.symmetry import mean_probabilities
+from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.evaluate import main
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.play import main as play
 
 MODELS = sorted((Path(__file__).parent.parent / "models").glob("*.pt"))
@@ -94,7 +95,7 @@ def test_the_option_reaches_the_agents(
         asked.add(agent)
         return mean_probabilities(actor, observation, agent)
 
-    monkeypatch.setattr(planning if plan else checkpoint, "mean_probabilities", spied)
+    monkeypatch.setattr(search if plan else checkpoint, "mean_probabilities", spied)
     command = ["--policy", str(MODELS[-1]), "--symmetric", "--episodes", "2", *plan]
     assert main(command) == 0
     assert asked == {"orientation", "placement"}

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstate import AfterstateCritic
+from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.model import AGENTS, Actor, Critic, make_actor, make_critic
-from marl_pack.agents.trunk import PLANES, Network, Trunk, input_planes, widen
-from marl_pack.packing import Packing
+from marl_pack.agents.networks.actor_critic import AGENTS, Actor, Critic, make_actor, make_critic
+from marl_pack.agents.networks.trunk import PLANES, Network, Trunk, input_planes, widen
+from marl_pack.game.packing import Packing
 
 SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
 

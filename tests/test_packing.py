@@ -7,8 +7,8 @@ from marl_pack import bins as state
 from marl_pack.agents.heuristics import POLICIES, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.bins import ORIENTATIONS
+from marl_pack.game.packing import Packing
 from marl_pack.items import check_items
-from marl_pack.packing import Packing
 from marl_pack.stability import RULES, make_rule
 
 
@@ -66,7 +66,7 @@ def test_every_play_the_mask_allows_ends_with_an_item_that_has_no_place(
         assert torch.equal(game.alive, game.orientation_mask.any(1))
         assert torch.equal(game.orientation_mask, game.mask.flatten(2).any(2))
     items, weights = game.stream.item(game.stream_state, game.t)
-    assert not make_rule(rule)(game.bins, game.candidates(items, weights)).any()
+    assert not make_rule(rule)(game.bins, game.orient_item(items, weights)).any()
     for b in range(24):
         boxes = boxes_of(game.bins, b)
         assert (boxes[:, :3] + boxes[:, 3:] <= np.array(size)).all()

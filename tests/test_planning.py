@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from marl_pack.agents import planning
-from marl_pack.agents.checkpoint import learned_orientation_agent, learned_placement_agent
+from marl_pack.agents import search
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.model import Actor, make_actor, make_critic
-from marl_pack.agents.planning import Plan, Planner
+from marl_pack.agents.learning.checkpoint import learned_orientation_agent, learned_placement_agent
+from marl_pack.agents.networks.actor_critic import Actor, make_actor, make_critic
 from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.agents.search import Plan, Planner
 from marl_pack.evaluate import play
+from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
-from marl_pack.packing import Packing
 
 SIZE = (6, 6, 6)
 NETWORK = {"channels": 8, "layers": 2}
@@ -186,7 +186,7 @@ def test_the_work_may_be_cut_into_parts(
 ) -> None:
     planner = Planner(*agents, None, Plan(rollouts=3, top=5), FUTURES)
     at_once = torch.stack(planner(game(3)))
-    monkeypatch.setattr(planning, "AT_ONCE", 7 * 36)  # seven bins
+    monkeypatch.setattr(search, "AT_ONCE", 7 * 36)  # seven bins
     assert torch.equal(torch.stack(planner(game(3))), at_once)
 
 

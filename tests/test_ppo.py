@@ -9,13 +9,13 @@ from rsl_rl.algorithms import PPO
 from torch import Tensor
 
 from marl_pack import evaluate
-from marl_pack.agents import checkpoint
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.runner import RunInterruptedError, Runner
+from marl_pack.agents.learning.symmetry import see_through_symmetries
 from marl_pack.agents.policy import Policy
-from marl_pack.agents.runner import RunInterruptedError, Runner
-from marl_pack.agents.symmetry import see_through_symmetries
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.config import Config, parse
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.train import evaluation, make_game, make_runner
 
 TINY = (

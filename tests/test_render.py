@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from marl_pack.render import PALETTE, draw, paint_order, save
+from marl_pack.render.picture import PALETTE, draw, paint_order, save
 
 SIZE = (10, 10, 10)
 TOWARDS_CAMERA = np.array([0.4722, -0.7556, 0.4540])  # elevation 27°, azimuth -58°

@@ -7,11 +7,18 @@ import pytest
 import torch
 from conftest import in_play
 
+from marl_pack.agents.afterstates import bitboards
+from marl_pack.agents.afterstates.afterstates import (
+    WORTH_A_THREAD,
+    Afterstates,
+    _left_torch,
+    afterstates_of,
+    probe_lengths,
+)
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.packing import Packing
-from marl_pack.stability import bitboards, reference
-from marl_pack.stability.room import WORTH_A_THREAD, Left, _left_torch, left_after, probe_lengths
+from marl_pack.game.packing import Packing
+from marl_pack.stability import reference
 
 GAMES = (
     {},
@@ -59,7 +66,7 @@ def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) ->
     assert not fits[~game.mask].any()
 
 
-def maps(left: Left, game: Packing) -> list[torch.Tensor]:
+def maps(left: Afterstates, game: Packing) -> list[torch.Tensor]:
     """Everything that is known of each placement, on the bins' maps."""
     known = [left.counts.flatten(1), left.surface, left.volume[:, None], left.waste[:, None],
              left.filled[:, None], left.room()[:, None],
@@ -68,7 +75,7 @@ def maps(left: Left, game: Packing) -> list[torch.Tensor]:
 
 
 def settings_of_left(game: Packing) -> tuple[object, ...]:
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     return game.bins, sides, game.mask, probe_lengths(*game.stream.sides)
 
 
@@ -77,7 +84,7 @@ def test_tensor_code_gives_the_same_numbers(settings: dict[str, object]) -> None
     game = in_play(6, 9, **settings)
     known = settings_of_left(game)
     for ours, theirs in zip(
-        maps(left_after(*known), game), maps(_left_torch(*known), game), strict=True
+        maps(afterstates_of(*known), game), maps(_left_torch(*known), game), strict=True
     ):
         assert torch.allclose(ours.double(), theirs.double(), rtol=0, atol=1e-6)
         if not ours.is_floating_point():
@@ -91,9 +98,9 @@ def test_sets_of_bits_say_what_maps_say(
     game = in_play(64, 12, **settings)
     assert bitboards.hold(*game.size[:2])
     known = settings_of_left(game)
-    bits = left_after(*known)
+    bits = afterstates_of(*known)
     monkeypatch.setattr(bitboards, "hold", lambda width, depth: False)
-    assert torch.equal(left_after(*known).counts, bits.counts)
+    assert torch.equal(afterstates_of(*known).counts, bits.counts)
 
 
 def test_what_is_said_of_a_placement_is_what_it_does() -> None:
@@ -120,10 +127,10 @@ def test_what_is_said_of_a_placement_is_what_it_does() -> None:
 
 def test_lengths_longer_than_the_floor_have_no_place() -> None:
     game = in_play(4, 3, size=(3, 12, 9), sides=(1, 3))
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     for lengths in ((4, 5), (2, 13), (20,)):
         known = game.bins, sides, game.mask, lengths
-        ours, theirs = left_after(*known), _left_torch(*known)
+        ours, theirs = afterstates_of(*known), _left_torch(*known)
         for counts in (ours, theirs):
             assert not counts.counts[:, -1].any()
         assert torch.equal(maps(ours, game)[0], maps(theirs, game)[0])
@@ -140,7 +147,7 @@ def test_a_branch_knows_what_is_left_already() -> None:
     which = torch.tensor([4, 1, 1])
     branch = game.branch(which)
     assert branch.left().counts is left.counts
-    fresh = left_after(*settings_of_left(branch))
+    fresh = afterstates_of(*settings_of_left(branch))
     for known, made in zip(maps(branch.left(), branch), maps(fresh, branch), strict=True):
         assert torch.equal(known, made)
 
@@ -199,6 +206,6 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda t=threads: t)
-        given.append(maps(left_after(*settings_of_left(game)), game))
+        given.append(maps(afterstates_of(*settings_of_left(game)), game))
     for alone, shared in zip(*given, strict=True):
         assert torch.equal(alone, shared)

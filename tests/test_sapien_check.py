@@ -11,7 +11,7 @@ import pytest
 
 from marl_pack import evaluate
 from marl_pack.evaluate import load_stacks
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.sapien_check import (
     Physics,
     SimulationError,
@@ -24,8 +24,8 @@ from marl_pack.sapien_check import (
     table1,
 )
 from marl_pack.sapien_check.__main__ import main
+from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import GROUND_BIT, World, collision_groups
-from marl_pack.sapien_check.packings import Bodies
 from marl_pack.stability import in_equilibrium
 
 BIN = (10, 10, 10)

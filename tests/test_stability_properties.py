@@ -17,8 +17,7 @@ from marl_pack import bins as state
 from marl_pack.bins import Bins, oriented
 from marl_pack.stability import (
     RULES,
-    Candidates,
-    candidates,
+    OrientedItem,
     equilibrium,
     hull_1,
     hull_alpha,
@@ -27,6 +26,7 @@ from marl_pack.stability import (
     in_equilibrium,
     lbcp,
     make_rule,
+    orient_item,
     reference,
     stable_mask,
     static_equilibrium,
@@ -43,19 +43,19 @@ def some_items(n: int, sides: tuple[int, int], seed: int) -> Tensor:
     return torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
 
 
-def off_centre(items: Tensor, seed: int) -> Candidates:
-    """Candidates with a centre of mass anywhere in the middle half of each footprint."""
+def off_centre(items: Tensor, seed: int) -> OrientedItem:
+    """OrientedItem with a centre of mass anywhere in the middle half of each footprint."""
     generator = torch.Generator().manual_seed(seed)
     sides = oriented(items)
     share = 0.25 + 0.5 * torch.rand(*sides.shape[:2], 2, generator=generator, dtype=torch.float64)
-    return Candidates(sides, share * sides[..., :2])
+    return OrientedItem(sides, share * sides[..., :2])
 
 
 # --- the batched codes against the plain reference ------------------------------------------------
 
 
 def expected(
-    bins: Bins, item: Candidates, stands: Callable[[int, int, int, int, int, int], bool]
+    bins: Bins, item: OrientedItem, stands: Callable[[int, int, int, int, int, int], bool]
 ) -> np.ndarray:
     """Every cell by ``stands(bin, candidate, x, y, w, d)``, in a loop."""
     sides = item.sides.numpy()
@@ -84,7 +84,7 @@ def test_hull_masks_equal_the_reference_cell_by_cell(
 ) -> None:
     bins = random_maps(12, size, sides, 12, seed=1)
     items = some_items(12, sides, 2)
-    item = candidates(items) if com == "central" else off_centre(items, 3)
+    item = orient_item(items) if com == "central" else off_centre(items, 3)
     holds = {
         "hull_1": torch.ones_like(bins.empty_map, dtype=torch.bool),
         "hull_alpha": bins.empty_map == 0,
@@ -112,7 +112,7 @@ def test_area_masks_equal_the_reference_cell_by_cell(
     size: tuple[int, int, int], sides: tuple[int, int], thresholds: str
 ) -> None:
     bins = random_maps(12, size, sides, 12, seed=4)
-    item = candidates(some_items(12, sides, 5))
+    item = orient_item(some_items(12, sides, 5))
     pairs = support_area.check_thresholds(thresholds)
 
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
@@ -141,7 +141,7 @@ def test_larger_maps_are_equal_on_cpu_and_tensor_code(size: tuple[int, int, int]
     bins = random_maps(24, size, (2, longest), 25, seed=6)
     for seed in range(3):
         items = some_items(24, (2, longest), seed)
-        for item in (candidates(items), off_centre(items, seed)):
+        for item in (orient_item(items), off_centre(items, seed)):
             for margin in (0.0, 1.3):
                 got = hull_cpu.support_mask(
                     bins.heightmap.numpy(),
@@ -162,7 +162,7 @@ def test_hull_alpha_equals_opencvs_hull_of_the_squares_corners(
     size: tuple[int, int, int], sides: tuple[int, int]
 ) -> None:
     bins = random_maps(12, size, sides, 12, seed=7)
-    item = candidates(some_items(12, sides, 8))
+    item = orient_item(some_items(12, sides, 8))
 
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
         heights = bins.heightmap[b, x : x + w, y : y + d].numpy()
@@ -182,7 +182,7 @@ def test_any_pattern_of_contact_is_judged_as_the_reference_does(
 ) -> None:
     cells = np.array([bits >> k & 1 for k in range(36)], dtype=bool).reshape(6, 6)
     heights = torch.from_numpy(cells.astype(np.int16))[None]
-    item = Candidates(
+    item = OrientedItem(
         torch.tensor([[[6, 6, 1]]], dtype=torch.int16),
         torch.tensor([[[x, y]]], dtype=torch.float64),
     )
@@ -203,7 +203,7 @@ def test_any_pattern_of_contact_is_judged_as_the_reference_does(
 # --- the order of the rules -----------------------------------------------------------------------
 
 
-def assert_order(bins: Bins, item: Candidates) -> tuple[int, int, int, int]:
+def assert_order(bins: Bins, item: OrientedItem) -> tuple[int, int, int, int]:
     alpha, load, exact, one = (rule(bins, item) for rule in (hull_alpha, lbcp, equilibrium, hull_1))
     assert not (alpha & ~load).any()
     assert not (load & ~exact).any()
@@ -217,7 +217,7 @@ def test_alpha_within_lbcp_within_equilibrium_within_hull_1(
     rule: str, size: tuple[int, int, int], sides: tuple[int, int]
 ) -> None:
     bins = random_play(make_rule(rule), 60, size, sides, 14, seed=9)
-    sizes = assert_order(bins, candidates(some_items(60, sides, 10)))
+    sizes = assert_order(bins, orient_item(some_items(60, sides, 10)))
     if size == (10, 10, 10):
         assert sizes[0] < sizes[1] < sizes[2] < sizes[3]  # the inclusions are strict
 
@@ -230,12 +230,12 @@ def test_the_order_holds_on_every_small_stack_of_three() -> None:
     bins = state.empty(len(pairs), (1, 5, 9), max_boxes=3)
     for k in range(2):
         sides = torch.tensor([[1, p[k][0], p[k][1]] for p in pairs], dtype=torch.int16)
-        allowed = equilibrium(bins, Candidates(sides[:, None]))[:, 0, 0]
+        allowed = equilibrium(bins, OrientedItem(sides[:, None]))[:, 0, 0]
         cell = torch.tensor([p[k][2] for p in pairs])
         stands = allowed.gather(1, cell[:, None]).squeeze(1)
         state.place(bins, torch.where(stands[:, None], sides, 0), cell)
     for kind in kinds:
-        item = Candidates(torch.tensor(kind, dtype=torch.int16).expand(len(pairs), 1, 3))
+        item = OrientedItem(torch.tensor(kind, dtype=torch.int16).expand(len(pairs), 1, 3))
         exact = equilibrium(bins, item)
         assert_order(bins, item)
         for b in range(0, len(pairs), 7):
@@ -267,7 +267,7 @@ def test_sound_rules_hold_whatever_the_centre_of_mass_is_if_it_is_known(rule: st
     generator = torch.Generator().manual_seed(13)
     for step in range(15):
         item = off_centre(some_items(60, (1, 5), 100 + step), step)
-        item = Candidates(item.sides[:, :1], item.com[:, :1])
+        item = OrientedItem(item.sides[:, :1], item.com[:, :1])
         allowed = bound(bins, item)[:, 0].flatten(1)
         cell = torch.multinomial(allowed.float() + 1e-12, 1, generator=generator)[:, 0]
         stands = allowed.gather(1, cell[:, None])
@@ -303,7 +303,7 @@ def test_reduced_equilibrium_equals_the_whole_stacks_linear_program(
         weight = (
             torch.rand(60, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 99
         )
-    item = candidates(items, weight)
+    item = orient_item(items, weight)
     exact, band = equilibrium(bins, item), hull_1(bins, item) & ~hull_alpha(bins, item)
     checked, positive = 0, []
     for b, a, x, y in band.nonzero().tolist()[:400]:
@@ -330,7 +330,7 @@ def test_reduced_equilibrium_equals_the_linear_program_on_tall_stacks(
     size: tuple[int, int, int], sides: tuple[int, int], steps: int
 ) -> None:
     bins = random_play(equilibrium, 8, size, sides, steps, seed=30)
-    item = candidates(some_items(8, sides, 31))
+    item = orient_item(some_items(8, sides, 31))
     exact, band = equilibrium(bins, item), hull_1(bins, item) & ~hull_alpha(bins, item)
     cells = band.nonzero()
     assert len(cells) > 100
@@ -363,7 +363,7 @@ def test_stacks_that_try_the_simplex_hard(
 
 def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     bins = random_play(hull_alpha, 6, (7, 7, 12), (1, 5), 12, seed=32)
-    item = candidates(some_items(6, (1, 5), 33))
+    item = orient_item(some_items(6, (1, 5), 33))
     expected_mask = equilibrium(bins, item)
 
     def unsure(*arrays: np.ndarray) -> None:
@@ -376,12 +376,12 @@ def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.M
 
 def test_equilibrium_with_a_margin_asks_for_every_place_of_the_centre() -> None:
     bins = random_play(hull_alpha, 60, (7, 7, 12), (1, 5), 16, seed=18)
-    item = candidates(some_items(60, (1, 5), 19))
+    item = orient_item(some_items(60, (1, 5), 19))
     free, kept = equilibrium(bins, item), equilibrium(bins, item, margin=0.4)
     assert not (kept & ~free).any()
     assert kept.sum() < free.sum()
     for dx, dy in ((0.4, 0), (-0.4, 0), (0, 0.4), (0, -0.4), (0.28, -0.28)):
-        moved = Candidates(item.sides, item.centres() + torch.tensor([dx, dy]))
+        moved = OrientedItem(item.sides, item.centres() + torch.tensor([dx, dy]))
         assert not (kept & ~equilibrium(bins, moved)).any()
 
 
@@ -409,7 +409,7 @@ def transposed(bins: Bins) -> Bins:
 def test_masks_follow_the_bins_symmetries(rule: str) -> None:
     bound = make_rule(rule)
     bins = random_play(hull_alpha, 30, (8, 6, 12), (1, 5), 14, seed=20)
-    item = candidates(some_items(30, (1, 5), 21))
+    item = orient_item(some_items(30, (1, 5), 21))
     mask = bound(bins, item)
     turned = bound(mirrored(bins), item)
     for b, a, x, y in mask.nonzero().tolist():
@@ -424,7 +424,7 @@ def test_masks_follow_the_bins_symmetries(rule: str) -> None:
 def test_a_bins_mask_does_not_depend_on_the_others(rule: str) -> None:
     bound = make_rule(rule)
     bins = random_play(hull_alpha, 20, (10, 10, 10), (2, 5), 10, seed=22)
-    item = candidates(some_items(20, (2, 5), 23))
+    item = orient_item(some_items(20, (2, 5), 23))
     together = bound(bins, item)
     for b in (0, 7, 19):
         alone = torch.tensor([b])
@@ -437,6 +437,6 @@ def test_candidates_with_a_zero_side_have_no_cell() -> None:
         for axis in range(3):
             sides = torch.full((8, 6, 3), 2, dtype=torch.int16)
             sides[:, ::2, axis] = 0
-            mask = make_rule(rule)(bins, Candidates(sides))
+            mask = make_rule(rule)(bins, OrientedItem(sides))
             assert not mask[:, ::2].any()
             assert mask[:, 1::2].any()

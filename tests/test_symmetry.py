@@ -5,12 +5,12 @@ import torch
 from torch import Tensor
 
 from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstate import AfterstateCritic
+from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.model import make_actor
-from marl_pack.agents.symmetry import carry, count, mean_probabilities, see, transform
-from marl_pack.agents.trunk import PLANES, Network
-from marl_pack.packing import Packing
+from marl_pack.agents.learning.symmetry import carry, count, mean_probabilities, see, transform
+from marl_pack.agents.networks.actor_critic import make_actor
+from marl_pack.agents.networks.trunk import PLANES, Network
+from marl_pack.game.packing import Packing
 
 SIZE = (6, 6, 8)
 CRITIC = AfterstateCritic()

@@ -15,8 +15,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from marl_pack.agents import checkpoint
-from marl_pack.agents.runner import Runner
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.runner import Runner
 from marl_pack.train import main
 
 SMALL = (
@@ -307,7 +307,7 @@ def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Pat
     script.write_text(
         "import os, sys, torch\n"
         "from marl_pack import train\n"
-        "from marl_pack.agents.runner import Runner\n"
+        "from marl_pack.agents.learning.runner import Runner\n"
         "learned = Runner.train\n"
         "def keep(self, iterations):\n"
         "    learned(self, iterations)\n"

@@ -5,7 +5,7 @@ import torch
 
 from marl_pack import bins as state
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.stability import windows
 
 
@@ -19,7 +19,7 @@ def played(n: int = 12, size: tuple[int, int, int] = (7, 6, 9)) -> Packing:
 
 def test_rest_and_waste_are_what_setting_the_box_down_gives() -> None:
     game = played()
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     rest, waste = windows.rest_and_waste(game.bins, sides)
     tried = game.mask.nonzero()[::7]
     for b, o, x, y in tried.tolist():
@@ -41,7 +41,7 @@ def test_windows_that_leave_the_bin_rest_at_its_top() -> None:
 
 def test_compiled_and_tensor_code_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     game = played()
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     sides[0, 2] = 0
     compiled = windows.rest_and_waste(game.bins, sides)
     monkeypatch.setattr(windows, "compiled", lambda device: False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from marl_pack.agents.afterstates.afterstates import MOST_LENGTHS
 from marl_pack.agents.policy import (
     Choice,
     OrientationAgent,
@@ -21,8 +22,7 @@ from marl_pack.agents.policy import (
     in_turns,
 )
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.packing import Packing
-from marl_pack.stability.room import MOST_LENGTHS
+from marl_pack.game.packing import Packing
 from marl_pack.stability.windows import rest_and_waste
 
 
@@ -41,7 +41,7 @@ class View:
 
 
 def _view(game: Packing, waste: bool = False) -> View:
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     w, d, h = (sides[..., k, None, None].long() for k in range(3))
     z, wasted = rest_and_waste(game.bins, sides, waste=waste)
     x = torch.arange(game.size[0], device=game.device)[:, None]

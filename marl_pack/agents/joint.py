@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from marl_pack.agents import orientation
-from marl_pack.agents.afterstate import AfterstateCritic
-from marl_pack.agents.trunk import Network, ScoreMap
-from marl_pack.packing import Packing
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.networks.trunk import Network, ScoreMap
+from marl_pack.game.packing import Packing
 
 WAYS = orientation.WAYS
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from marl_pack.agents.afterstate import ILLEGAL, AfterstateCritic
-from marl_pack.agents.trunk import Network, pooled_head
+from marl_pack.agents.afterstates.critic import ILLEGAL, AfterstateCritic
+from marl_pack.agents.networks.trunk import Network, pooled_head
 from marl_pack.bins import ORIENTATIONS, utilization
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.stability.windows import rest_and_waste
 
 WAYS = len(ORIENTATIONS)
@@ -26,7 +26,7 @@ def observe(
 
     Args:
         game: the bins.
-        planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`), for all orientations.
+        planes: extra planes (:data:`marl_pack.agents.networks.trunk.PLANES`), for all orientations.
         afterstates: who says what placements are worth, for the plane ``worth``.
 
     Returns:
@@ -44,7 +44,7 @@ def observe(
     }
     if "mask" in planes:
         seen["cells"] = game.mask
-    sides = game.candidates(game.items, game.weights).sides
+    sides = game.orient_item(game.items, game.weights).sides
     return seen | under(game, sides, planes) | ahead(game, planes, afterstates)
 
 

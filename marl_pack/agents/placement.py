@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from marl_pack.agents.afterstate import AfterstateCritic
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.networks.trunk import Network, ScoreMap
 from marl_pack.agents.orientation import ahead, under
-from marl_pack.agents.trunk import Network, ScoreMap
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 WAYS = 1
 
@@ -29,7 +29,7 @@ def observe(
 
     Args:
         game: the bins.
-        planes: extra planes (:data:`marl_pack.agents.trunk.PLANES`).
+        planes: extra planes (:data:`marl_pack.agents.networks.trunk.PLANES`).
         orientation: int64 [N].
         heightmap: a copy of the game's that is at hand, to save making another.
         afterstates: who says what placements are worth, for the plane ``worth``.

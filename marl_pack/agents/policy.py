@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 Choice = tuple[Tensor, Tensor]
 """(orientation int64 [N], cell int64 [N])."""

@@ -1,8 +1,8 @@
 """What the conveyor brings: streams of items (drawn, cut, given) and files of them."""
 
-from marl_pack.items.choice import DEFAULT_SIDES, GENERATED, choose_stream, load, make_stream
 from marl_pack.items.cutting import cut
-from marl_pack.items.given import Sequences, check_items
+from marl_pack.items.sequences import Sequences, check_items
+from marl_pack.items.sources import DEFAULT_SIDES, GENERATED, choose_stream, load, make_stream
 from marl_pack.items.streams import Cut, Drawn, Stream, Uniform, fingerprint, independent
 
 __all__ = [

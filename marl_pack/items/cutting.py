@@ -10,7 +10,7 @@ from numba import njit
 from torch import Tensor
 
 from marl_pack.bins import Size, check_size
-from marl_pack.items.counting import draw, episode_keys
+from marl_pack.items.random_numbers import draw, episode_keys
 
 
 def check_sides(sides: tuple[int, int]) -> tuple[int, int]:

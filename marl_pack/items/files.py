@@ -1,7 +1,7 @@
 """Reading item sequences from ``.npz``, ``.json`` and ``.csv`` files.
 
 What a file says is brought into one form here; whether its items can be is looked at by
-:func:`marl_pack.items.given.check_items`.
+:func:`marl_pack.items.sequences.check_items`.
 """
 
 from __future__ import annotations

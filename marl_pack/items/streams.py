@@ -21,8 +21,8 @@ from torch import Tensor
 
 from marl_pack import bins
 from marl_pack.bins import Size
-from marl_pack.items.counting import GOLDEN, below, draw, episode_keys, mix
 from marl_pack.items.cutting import cut
+from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mix
 
 
 class Stream(Protocol):

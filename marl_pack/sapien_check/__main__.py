@@ -32,8 +32,8 @@ from rich.table import Table
 from marl_pack.evaluate import Episodes, load_stacks, save_stacks
 from marl_pack.files import check_writable, write_json
 from marl_pack.sapien_check import controls, table1
+from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import DEFAULT, Physics, SimulationError, Verdict, judge_all
-from marl_pack.sapien_check.packings import Bodies
 from marl_pack.stability import RULES
 
 

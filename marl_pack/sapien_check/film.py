@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from marl_pack.files import check_writable, moved_into_place
-from marl_pack.render import PALETTE
+from marl_pack.render.picture import PALETTE
 from marl_pack.sapien_check.judge import DEFAULT, Pass, Physics, World
 from marl_pack.sapien_check.stack import Floats, Stack
 

@@ -21,10 +21,10 @@ from torch import Tensor
 
 from marl_pack.bins import Bins
 from marl_pack.evaluate import Episodes
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 from marl_pack.sapien_check.judge import DEFAULT, Physics, check, in_order
 from marl_pack.sapien_check.stack import DENSITY, Stack
-from marl_pack.stability import Candidates, Rule, in_equilibrium, make_rule
+from marl_pack.stability import OrientedItem, Rule, in_equilibrium, make_rule
 
 SIZE, CELL, SIDES = (120, 120, 120), 0.005, (6, 60)
 PAPER: dict[str, dict[str, Any]] = {
@@ -75,7 +75,7 @@ class Timed:
         self.rule = rule
         self.taken: list[float] = []  # CPU seconds, a mask each
 
-    def __call__(self, bins: Bins, item: Candidates) -> Tensor:
+    def __call__(self, bins: Bins, item: OrientedItem) -> Tensor:
         """The rule's mask."""
         start = time.process_time()
         mask = self.rule(bins, item)

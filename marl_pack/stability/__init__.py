@@ -9,7 +9,7 @@ window at a time, is in :mod:`marl_pack.stability.reference`.
 """
 
 from marl_pack.stability.arrays import stable_mask
-from marl_pack.stability.candidates import Candidates, Rule, candidates
+from marl_pack.stability.oriented_item import OrientedItem, Rule, orient_item
 from marl_pack.stability.rules import (
     RULES,
     area_ratio,
@@ -24,10 +24,9 @@ from marl_pack.stability.static_equilibrium import in_equilibrium
 
 __all__ = [
     "RULES",
-    "Candidates",
+    "OrientedItem",
     "Rule",
     "area_ratio",
-    "candidates",
     "equilibrium",
     "hull_1",
     "hull_alpha",
@@ -35,5 +34,6 @@ __all__ = [
     "lbcp",
     "make_rule",
     "none",
+    "orient_item",
     "stable_mask",
 ]

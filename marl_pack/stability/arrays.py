@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.bins import Bins, check_size
-from marl_pack.stability.candidates import NO_OFFSET, Candidates, Rule, check_com_offset
+from marl_pack.stability.oriented_item import NO_OFFSET, OrientedItem, Rule, check_com_offset
 from marl_pack.stability.rules import equilibrium, lbcp, make_rule
 from marl_pack.stability.static_equilibrium import uniform_loads
 
@@ -92,7 +92,7 @@ def stable_mask(
     offset = check_com_offset(com_offset)
     com = (0.5 + torch.tensor(offset[:2], dtype=torch.float64)) * torch.from_numpy(sides[:2])
     clipped = np.minimum(sides, np.iinfo(np.int16).max).astype(np.int16)
-    candidate = Candidates(
+    candidate = OrientedItem(
         torch.from_numpy(clipped)[None, None],
         com[None, None] if any(offset[:2]) else None,
         None if weight is None else torch.tensor([float(weight)]),

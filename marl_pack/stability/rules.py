@@ -15,12 +15,12 @@ from torch import Tensor
 from marl_pack import bins as state
 from marl_pack.bins import Bins
 from marl_pack.stability import hull_cpu, hull_torch, support_area
-from marl_pack.stability.candidates import Candidates, Rule
 from marl_pack.stability.load_bearing import lbcp_bearing
+from marl_pack.stability.oriented_item import OrientedItem, Rule
 from marl_pack.stability.static_equilibrium import equilibrium_mask
 
 
-def _supported(bins: Bins, item: Candidates, hollow: Tensor, margin: float) -> Tensor:
+def _supported(bins: Bins, item: OrientedItem, hollow: Tensor, margin: float) -> Tensor:
     if not state.compiled(bins.device):
         return hull_torch.support_mask(
             bins.heightmap, hollow, item.sides, bins.height, item.com, margin
@@ -32,7 +32,7 @@ def _supported(bins: Bins, item: Candidates, hollow: Tensor, margin: float) -> T
     return torch.from_numpy(mask)
 
 
-def hull_1(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
+def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """convexHull-1: the centre of mass strictly inside the hull of all contact squares.
 
     Args:
@@ -46,7 +46,7 @@ def hull_1(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
     return _supported(bins, item, torch.zeros_like(bins.heightmap), margin)
 
 
-def hull_alpha(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
+def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """convexHull-α (Algorithm 1): only contact squares over filled columns count.
 
     Sound for any masses and for whatever the rule places later: each weight goes straight down
@@ -55,7 +55,7 @@ def hull_alpha(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
     return _supported(bins, item, bins.empty_map, margin)
 
 
-def lbcp(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
+def lbcp(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """Load-bearable convex polygons: gap cells inside a box's support polygon count as well.
 
     Arguments as :func:`hull_1`. The polygons are replayed from ``bins.boxes``.
@@ -64,7 +64,7 @@ def lbcp(bins: Bins, item: Candidates, margin: float = 0.0) -> Tensor:
 
 
 def area_ratio(
-    bins: Bins, item: Candidates, thresholds: support_area.Thresholds | str = "paper"
+    bins: Bins, item: OrientedItem, thresholds: support_area.Thresholds | str = "paper"
 ) -> Tensor:
     """Zhao et al. 2021: share of the bottom face supported, and number of its corners.
 
@@ -82,7 +82,7 @@ def area_ratio(
 
 
 def equilibrium(
-    bins: Bins, item: Candidates, margin: float = 0.0, check_stack: bool = False
+    bins: Bins, item: OrientedItem, margin: float = 0.0, check_stack: bool = False
 ) -> Tensor:
     """Exact strict equilibrium of the whole stack (:mod:`marl_pack.stability.static_equilibrium`).
 
@@ -98,7 +98,7 @@ def equilibrium(
     return equilibrium_mask(bins, item, surely, possibly, margin, check_stack)
 
 
-def none(bins: Bins, item: Candidates) -> Tensor:
+def none(bins: Bins, item: OrientedItem) -> Tensor:
     """No stability rule: wherever the item fits into the bin, set down from above.
 
     To compare with, and for the judge to have something to say no to.

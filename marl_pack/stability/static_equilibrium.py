@@ -43,8 +43,8 @@ from scipy.sparse import csc_array
 from torch import Tensor
 
 from marl_pack.bins import Bins
-from marl_pack.stability.candidates import Candidates
 from marl_pack.stability.hull_cpu import envelope
+from marl_pack.stability.oriented_item import OrientedItem
 from marl_pack.stability.simplex import max_least_force
 
 STRICT = 1e-9
@@ -333,7 +333,7 @@ def _solve_band(
 
 def equilibrium_mask(
     bins: Bins,
-    candidates: Candidates,
+    candidates: OrientedItem,
     surely: Tensor,
     possibly: Tensor,
     margin: float = 0.0,
@@ -380,7 +380,13 @@ def equilibrium_mask(
 
 
 def _stands_by_highs(
-    stack: Bins, candidates: Candidates, b: int, a: int, x: int, y: int, shifts: NDArray[np.float64]
+    stack: Bins,
+    candidates: OrientedItem,
+    b: int,
+    a: int,
+    x: int,
+    y: int,
+    shifts: NDArray[np.float64],
 ) -> bool:
     """The verdict on one cell by the whole stack's linear program."""
     k = int(stack.count[b])

@@ -11,10 +11,10 @@ from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
 from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstate import AfterstateCritic
-from marl_pack.agents.distribution import MaskedCategorical
-from marl_pack.agents.trunk import Features, Network, Trunk, pooled_head
-from marl_pack.packing import Packing
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.networks.distribution import MaskedCategorical
+from marl_pack.agents.networks.trunk import Features, Network, Trunk, pooled_head
+from marl_pack.game.packing import Packing
 
 AGENTS: dict[str, ModuleType] = {
     "orientation": orientation,
@@ -31,7 +31,7 @@ class Actor(MLPModel):
         obs: an observation of N bins; any Mapping of tensors does.
         obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
         agent: one of :data:`AGENTS`.
-        network: fields of :class:`marl_pack.agents.trunk.Network`.
+        network: fields of :class:`marl_pack.agents.networks.trunk.Network`.
 
     Attributes:
         afterstates: who says what placements are worth, if its network sees that, else None. Kept

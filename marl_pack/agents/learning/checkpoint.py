@@ -4,10 +4,11 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
 
 - ``format``: 1; ``marl_pack``: the version that wrote it;
 - ``config``: the run's resolved settings;
-- ``agents``: for each agent its ``network`` (fields of :class:`marl_pack.agents.trunk.Network`) and
-  weights as rsl_rl's ``PPO.save()`` gives them (``actor_state_dict``, ``critic_state_dict``,
-  ``optimizer_state_dict``), or the ``name`` of the rule that plays a frozen one; while it
-  imitates, ``imitated`` too: whom, as is kept of a frozen agent;
+- ``agents``: for each agent its ``network`` (fields of
+  :class:`marl_pack.agents.networks.trunk.Network`) and weights as rsl_rl's ``PPO.save()`` gives
+  them (``actor_state_dict``, ``critic_state_dict``, ``optimizer_state_dict``), or the ``name`` of
+  the rule that plays a frozen one; while it imitates, ``imitated`` too: whom, as is kept of a
+  frozen agent;
 - ``iter``, ``items``, ``seconds``, ``evaluations``: how far the run was and what it had reached;
 - ``state``: in a run's latest checkpoint only, what resuming needs.
 """
@@ -30,7 +31,8 @@ from marl_pack.agents.heuristics import (
     make_placement_agent,
     make_policy,
 )
-from marl_pack.agents.model import Actor, Critic, make_actor, make_critic
+from marl_pack.agents.learning.symmetry import mean_probabilities
+from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.policy import (
     Choice,
     OrientationAgent,
@@ -38,10 +40,9 @@ from marl_pack.agents.policy import (
     Policy,
     in_turns,
 )
-from marl_pack.agents.symmetry import mean_probabilities
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.files import write_atomically
-from marl_pack.packing import Packing
+from marl_pack.game.packing import Packing
 
 FORMAT = 1
 LATEST, BEST = "latest.pt", "best.pt"
@@ -157,7 +158,7 @@ def learned_orientation_agent(actor: Actor, symmetric: bool = False) -> Orientat
     Args:
         actor: the network.
         symmetric: whether it is asked in all symmetries of the bin
-            (:func:`marl_pack.agents.symmetry.mean_probabilities`).
+            (:func:`marl_pack.agents.learning.symmetry.mean_probabilities`).
     """
     return lambda game: _best(actor, "orientation", actor.see(game), symmetric)
 

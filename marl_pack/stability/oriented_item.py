@@ -12,16 +12,16 @@ from marl_pack.bins import ORIENTATIONS, Bins, oriented
 
 
 @dataclass(frozen=True)
-class Candidates:
+class OrientedItem:
     """One item per bin, turned in A ways. ``None`` means uniform mass (weight = volume)."""
 
     sides: Tensor  # int16 [N, A, 3]            w, d, h along x, y, z; a zero side: not a candidate
     com: Tensor | None = None  # float64 [N, A, 2]  centre of mass from the window's low corner
     weight: Tensor | None = None  # float64 [N]
 
-    def __getitem__(self, index: Tensor | slice) -> Candidates:
+    def __getitem__(self, index: Tensor | slice) -> OrientedItem:
         """The candidates of the chosen bins."""
-        return Candidates(
+        return OrientedItem(
             self.sides[index],
             None if self.com is None else self.com[index],
             None if self.weight is None else self.weight[index],
@@ -38,7 +38,7 @@ class Candidates:
         return self.sides.double().prod(-1).amax(1)
 
 
-Rule = Callable[[Bins, Candidates], Tensor]
+Rule = Callable[[Bins, OrientedItem], Tensor]
 """``(bins, candidates) -> bool [N, A, W, D]``: the cells (low corners) where each candidate fits
 into the bin and stands by the rule. Parameters are bound beforehand (:func:`functools.partial`)."""
 
@@ -60,11 +60,11 @@ def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def candidates(
+def orient_item(
     items: Tensor,
     weight: Tensor | None = None,
     com_offset: tuple[float, float, float] = NO_OFFSET,
-) -> Candidates:
+) -> OrientedItem:
     """All six orientations of one item per bin.
 
     Args:
@@ -75,10 +75,10 @@ def candidates(
     """
     sides = oriented(items)
     if not any(com_offset):
-        return Candidates(sides, None, weight)
+        return OrientedItem(sides, None, weight)
     turned = torch.tensor(
         [[com_offset[axis] for axis in permutation[:2]] for permutation in ORIENTATIONS],
         dtype=torch.float64,
         device=items.device,
     )
-    return Candidates(sides, (0.5 + turned) * sides[..., :2], weight)
+    return OrientedItem(sides, (0.5 + turned) * sides[..., :2], weight)

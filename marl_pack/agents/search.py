@@ -19,13 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack.agents.checkpoint import load_actor, load_critic
-from marl_pack.agents.model import Actor, Critic
+from marl_pack.agents.learning.checkpoint import load_actor, load_critic
+from marl_pack.agents.learning.symmetry import mean_probabilities
+from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.policy import Choice
-from marl_pack.agents.symmetry import mean_probabilities
 from marl_pack.bins import ORIENTATIONS, oriented
+from marl_pack.game.packing import Packing
 from marl_pack.items import Stream
-from marl_pack.packing import Packing
 
 AT_ONCE = 1 << 19
 """Cells of the floors of imagined games that are played at once, about."""
@@ -249,7 +249,7 @@ def make_planner(
     """Plan with the agents of a checkpoint.
 
     Args:
-        found: what :func:`marl_pack.agents.checkpoint.read` gave.
+        found: what :func:`marl_pack.agents.learning.checkpoint.read` gave.
         plan, futures, seed, symmetric: as for :class:`Planner`.
         device: of the games.
 

@@ -14,7 +14,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from torch import Tensor
 
-from marl_pack.agents.model import Actor
+from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.bins import oriented
 
 MAPS = (

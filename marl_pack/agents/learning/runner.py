@@ -23,11 +23,11 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 import marl_pack
-from marl_pack.agents import checkpoint
-from marl_pack.agents.model import AGENTS
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.ppo import PackingPPO
+from marl_pack.agents.networks.actor_critic import AGENTS
+from marl_pack.agents.networks.trunk import Network, widen
 from marl_pack.agents.policy import Policy
-from marl_pack.agents.ppo import PackingPPO
-from marl_pack.agents.trunk import Network, widen
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
@@ -53,7 +53,7 @@ class Progress:
     seconds: float  # spent learning since the run began
     utilization: float  # mean of the episodes that ended in this iteration; NaN if none did
     reward: float  # mean return of the last 100 episodes; NaN before the first
-    losses: dict[str, float]  # of :meth:`marl_pack.agents.ppo.PackingPPO.update`
+    losses: dict[str, float]  # of :meth:`marl_pack.agents.learning.ppo.PackingPPO.update`
 
 
 class IterationLogger(Logger):
@@ -92,7 +92,7 @@ class IterationLogger(Logger):
 
 
 class Runner(OnPolicyRunner):
-    """Trains the agents of :class:`marl_pack.agents.ppo.PackingPPO`.
+    """Trains the agents of :class:`marl_pack.agents.learning.ppo.PackingPPO`.
 
     Args:
         env: the bins.
@@ -211,7 +211,7 @@ class Runner(OnPolicyRunner):
     # --- checkpoints ------------------------------------------------------------------------------
 
     def checkpoint(self) -> dict[str, Any]:
-        """The run's settings, networks and progress, as :mod:`marl_pack.agents.checkpoint` says."""
+        """Settings, networks and progress, as :mod:`marl_pack.agents.learning.checkpoint` says."""
         algorithm = self.alg.save()
         learned = {
             name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
@@ -270,7 +270,7 @@ class Runner(OnPolicyRunner):
         """Take the learners' weights from another run; nothing else of it.
 
         Args:
-            found: what :func:`marl_pack.agents.checkpoint.read` gave.
+            found: what :func:`marl_pack.agents.learning.checkpoint.read` gave.
 
         Raises:
             ValueError: if an agent that learns here did not there, or has another network (it may
@@ -303,7 +303,7 @@ class Runner(OnPolicyRunner):
         """Go on exactly from the checkpoint of a run with the same settings.
 
         Args:
-            found: what :func:`marl_pack.agents.checkpoint.read` gave of the run's latest.
+            found: what :func:`marl_pack.agents.learning.checkpoint.read` gave of the run's latest.
 
         Raises:
             ValueError: if the checkpoint cannot be resumed by this run.

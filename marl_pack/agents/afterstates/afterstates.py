@@ -23,8 +23,9 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from marl_pack.agents.afterstates import bitboards
 from marl_pack.bins import ORIENTATIONS, Bins, compiled, footprint
-from marl_pack.stability import bitboards, hull_cpu, hull_torch
+from marl_pack.stability import hull_cpu, hull_torch
 
 MOST_LENGTHS = 5
 """Of so many lengths of a side boxes are made at most."""
@@ -33,7 +34,7 @@ SHARES = 10
 STEPS = 6
 """So many kinds of steps between neighbouring columns are told apart."""
 SURFACE = SHARES + 1 + STEPS
-"""Numbers that :attr:`Left.surface` has for each placement."""
+"""Numbers that :attr:`Afterstates.surface` has for each placement."""
 AT_ONCE = 1 << 20  # cells of masks made at once
 WORTH_A_THREAD = 256  # placements
 
@@ -45,7 +46,7 @@ def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class Left:
+class Afterstates:
     """What K legal placements would leave. Placements that are the same may share a row."""
 
     index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere of any
@@ -56,7 +57,7 @@ class Left:
     waste: Tensor  # int64 [K]            cells that it would enclose
     filled: Tensor  # int64 [K]           cells filled in the bin with it
 
-    def of(self, which: Tensor) -> Left:
+    def of(self, which: Tensor) -> Afterstates:
         """The same of the bins ``which``, int64 [B]; their placements' rows stay where they are."""
         return replace(self, index=self.index[which])
 
@@ -89,7 +90,7 @@ class Left:
         return torch.where(mask, values[self.index], elsewhere)
 
 
-def left_after(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Left:
+def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Afterstates:
     """What each legal placement would leave.
 
     Args:
@@ -175,7 +176,7 @@ def _describe(
         heights, hollow: int16 [K, W, D], after it.
         before: int64 [K], cells of ``hollow`` before it, over the whole floor.
         height: H.
-        surface, waste: as in :class:`Left`, written.
+        surface, waste: as in :class:`Afterstates`, written.
     """
     width, depth = heights.shape[1:]
     columns = np.float32(width * depth)
@@ -201,7 +202,7 @@ def _describe(
 
 @njit(cache=True, nogil=True)
 def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any) -> None:
-    """What :func:`marl_pack.stability.bitboards.judge` says, from masks.
+    """What :func:`marl_pack.agents.afterstates.bitboards.judge` says, from masks.
 
     Args:
         masks, best_level: [K, L · L, W · D], of boxes of the least height on each footprint.
@@ -218,7 +219,7 @@ def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any)
 
 @njit(cache=True, nogil=True)
 def _chance(counts: Any, ways: Any, chance: Any) -> None:
-    """:meth:`Left.chance` with ``ways`` int64 [O, 3], the orientations' rows."""
+    """:meth:`Afterstates.chance` with ``ways`` int64 [O, 3], the orientations' rows."""
     lengths = counts.shape[1]
     item = np.empty(3, np.int64)
     items = lengths**3
@@ -238,7 +239,7 @@ def _workers(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "room")
 
 
-def _left_cpu(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Left:
+def _left_cpu(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
     own, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
     index = np.zeros(mask.shape, np.int64)
     placements = _placements(legal, own, index)
@@ -272,7 +273,7 @@ def _left_cpu(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...])
     else:
         list(_workers(threads).map(judge, range(0, count, most)))
     volume = torch.from_numpy(own[placements[:, 0], placements[:, 1]].prod(1, dtype=np.int64))
-    return Left(
+    return Afterstates(
         torch.from_numpy(index), torch.from_numpy(counts), torch.from_numpy(surface), volume,
         torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume,
     )  # fmt: skip
@@ -292,7 +293,7 @@ def _masks(maps: Any, footprints: Any, height: int) -> tuple[Any, Any]:
 # --- tensor code ----------------------------------------------------------------------------------
 
 
-def _left_torch(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Left:
+def _left_torch(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
     width, depth, height = bins.size
     device = bins.device
     boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16, device=device)
@@ -317,14 +318,14 @@ def _left_torch(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...
         surface.append(_surface(after.long(), height))
         waste.append(gap.sum((1, 2), dtype=torch.int64))
     volume = sides[placements[:, 0], placements[:, 1]].long().prod(1)
-    return Left(
+    return Afterstates(
         index, torch.cat(counts).view(-1, *[len(lengths)] * 3), torch.cat(surface), volume,
         torch.cat(waste), bins.filled[placements[:, 0]] + volume,
     )  # fmt: skip
 
 
 def _surface(heights: Tensor, height: int) -> Tensor:
-    """:attr:`Left.surface` of maps int64 [K, W, D]."""
+    """:attr:`Afterstates.surface` of maps int64 [K, W, D]."""
     steps = [heights.diff(dim=axis).abs().flatten(1) for axis in (1, 2)]
     step = (torch.cat(steps, 1) * SHARES // height).clamp(max=STEPS - 1)
     share = (heights * SHARES // height).flatten(1)

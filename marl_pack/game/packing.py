@@ -21,11 +21,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from marl_pack import bins as state
+from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
 from marl_pack.bins import ORIENTATIONS, check_device, check_size
 from marl_pack.items import DEFAULT_SIDES, Stream, fingerprint, make_stream
-from marl_pack.stability import Candidates, Rule, candidates, make_rule
-from marl_pack.stability.candidates import NO_OFFSET, check_com_offset
-from marl_pack.stability.room import Left, left_after, probe_lengths
+from marl_pack.stability import OrientedItem, Rule, make_rule, orient_item
+from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
 
@@ -159,7 +159,7 @@ class Packing:
             most = min(most, self.stream.longest)
         self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
         self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
-        self._left: Left | None = None
+        self._left: Afterstates | None = None
         self._known: dict[Hashable, Tensor] = {}
         self.reset(seed, first_episode)
 
@@ -181,15 +181,15 @@ class Packing:
         if self.auto_reset:
             self._begin((~self.alive).nonzero().squeeze(1))
 
-    def left(self) -> Left:
+    def left(self) -> Afterstates:
         """What each legal placement of the visible items would leave; made once a turn.
 
         For boxes with sides between the stream's shortest and longest.
         """
         if self._left is None:
-            sides = self.candidates(self.items, self.weights).sides
+            sides = self.orient_item(self.items, self.weights).sides
             lengths = probe_lengths(*self.stream.sides)
-            self._left = left_after(self.bins, sides, self.mask, lengths)
+            self._left = afterstates_of(self.bins, sides, self.mask, lengths)
         return self._left
 
     def room(self) -> tuple[Tensor, Tensor]:
@@ -216,11 +216,11 @@ class Packing:
 
     def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:
         """Bool [N, 6, W, D]: where ``items`` [N, 3] may be set down in ``bins``, each way."""
-        return self.rule(bins, self.candidates(items, weights))
+        return self.rule(bins, self.orient_item(items, weights))
 
-    def candidates(self, items: Tensor, weights: Tensor) -> Candidates:
+    def orient_item(self, items: Tensor, weights: Tensor) -> OrientedItem:
         """The items in their six orientations; those that may not be chosen have zero sides."""
-        turned = candidates(items, weights, self.com_offset)
+        turned = orient_item(items, weights, self.com_offset)
         if self._banned:
             turned.sides[:, self._banned] = 0
         return turned
@@ -265,7 +265,7 @@ class Packing:
             sides = torch.where((alive & ~self.lost)[:, None], sides, 0)
         com = None
         if any(self.com_offset):
-            com = self.candidates(self.items, self.weights).centres()[self._index, orientation]
+            com = self.orient_item(self.items, self.weights).centres()[self._index, orientation]
         _, waste, volume = state.place(self.bins, sides, cell, self.weights, com)
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * volume).sub_(waste, alpha=self._loss).float()

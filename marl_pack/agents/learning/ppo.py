@@ -20,13 +20,14 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from marl_pack.agents import checkpoint, joint
-from marl_pack.agents.afterstate import AfterstateLearner
+from marl_pack.agents import joint
+from marl_pack.agents.afterstates.critic import AfterstateLearner
 from marl_pack.agents.heuristics import make_placement_agent
-from marl_pack.agents.model import Actor, Critic
+from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning.symmetry import see_through_symmetries
+from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.policy import OrientationAgent, PlacementAgent, draw
-from marl_pack.agents.symmetry import see_through_symmetries
-from marl_pack.packing import Packing, orientations_with_a_cell
+from marl_pack.game.packing import Packing, orientations_with_a_cell
 from marl_pack.vec_env import PackingVecEnv
 
 RANDOM_SHARE = 0.1  # of the choices of an agent that imitates, so that it does not grow too sure

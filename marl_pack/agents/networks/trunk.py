@@ -18,9 +18,10 @@ PLANES = ("mask", "rest", "waste", "room", "fits", "worth", "solid", "filled")
 """Extra planes a network may see. For each orientation its agent has to judge: the cells where the
 item may be set down, its resting height at every cell, the space it would enclose there, and what
 each placement would leave: in how many cells the next item may be set down in the mean, and how
-probable it is that it finds a place (:mod:`marl_pack.stability.room`), and what a critic of what is
-left thinks it worth (:mod:`marl_pack.agents.afterstate`). Once: the columns that are
-filled to the floor, which is what ``hull_alpha`` rests on; and how much of the bin is filled, which
+probable it is that it finds a place (:mod:`marl_pack.agents.afterstates.afterstates`), and what a
+critic of what is left thinks it worth (:mod:`marl_pack.agents.afterstates.critic`). Once: the
+columns that are filled to the floor, which is what ``hull_alpha`` rests on; and how much of the bin
+is filled, which
 where the items were cut from it says how much is still to come."""
 
 

@@ -2,10 +2,10 @@
 
 An afterstate is the bin with the item set down and the next one not yet seen (Sutton & Barto 2018,
 sec. 6.8). The critic tells the return that is still to come from what the placement leaves
-(:class:`marl_pack.stability.room.Left`): in how many cells each box that may come could be set
-down, how high the columns are and how rough the surface. None of it changes when the bin is
-mirrored or turned. It learns the agents' own returns, each placement's less its reward, beside
-their PPOs.
+(:class:`marl_pack.agents.afterstates.afterstates.Afterstates`): in how many cells each box that may
+come could be set down, how high the columns are and how rough the surface. None of it changes when
+the bin is mirrored or turned. It learns the agents' own returns, each placement's less its reward,
+beside their PPOs.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from marl_pack.agents.trunk import initialized
-from marl_pack.packing import Packing
-from marl_pack.stability.room import MOST_LENGTHS, SURFACE, Left
+from marl_pack.agents.afterstates.afterstates import MOST_LENGTHS, SURFACE, Afterstates
+from marl_pack.agents.networks.trunk import initialized
+from marl_pack.game.packing import Packing
 
 PAIRS = MOST_LENGTHS * (MOST_LENGTHS + 1) // 2
 FEATURES = 2 + PAIRS * MOST_LENGTHS + SURFACE
@@ -34,7 +34,7 @@ ILLEGAL = -1e6
 """What a placement that is not legal counts as worth: less than any that is."""
 
 
-def features(left: Left, volume: int, rows: Tensor | None = None) -> Tensor:
+def features(left: Afterstates, volume: int, rows: Tensor | None = None) -> Tensor:
     """What the critic sees, float32 [K, :data:`FEATURES`].
 
     Counts come as logarithms, those of a footprint and of the same turned by 90° as one; boxes of

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from marl_pack.bins import Size, check_size
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import read_fields
-from marl_pack.items.given import Sequences, check_items
+from marl_pack.items.sequences import Sequences, check_items
 from marl_pack.items.streams import Cut, Stream, Uniform
 
 GENERATED = ("rs", "cut1", "cut2")

@@ -1,0 +1,1 @@
+"""What a placement leaves behind, and its value."""

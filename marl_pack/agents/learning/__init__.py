@@ -1,0 +1,1 @@
+"""How the agents learn: PPO for both, behaviour cloning, symmetries, runs and checkpoints."""

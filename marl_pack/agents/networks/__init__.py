@@ -1,0 +1,1 @@
+"""The networks of the agents: input planes, trunk, heads and masked actions."""
