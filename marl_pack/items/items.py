@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -11,8 +12,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Items:
-    """Items with their attributes. Leading dimensions are free: [G] games, [S, L] sequences, …
+    """Items with their attributes, one tensor an attribute.
 
+    Leading dimensions are free, e.g. [G] for the visible item of G games or [S, L] for S sequences.
     An attribute that is None has its default for every item, which costs nothing to carry.
     """
 
@@ -21,15 +23,9 @@ class Items:
     orientations: Tensor | None = None  # bool [..., 6]  orientations it may be placed in; None: all
     ids: Tensor | None = None  # int64 [...]     number of the item; None: its place in the sequence
 
-    def map(self, change: Any) -> Items:
-        """Return the items with ``change`` (Tensor -> Tensor) applied to every field."""
-        return Items(
-            **{
-                field.name: None if value is None else change(value)
-                for field in fields(self)
-                for value in (getattr(self, field.name),)
-            }
-        )
+    def map(self, change: Callable[[Tensor], Tensor]) -> Items:
+        """Return the items with ``change`` applied to every field that is not None."""
+        return replace(self, **{name: change(value) for name, value in self.tensors().items()})
 
     def __getitem__(self, index: Any) -> Items:
         """Return the chosen items."""
