@@ -1,6 +1,6 @@
-"""Each trainer of ``examples/`` in an environment of its own: ``make trainers``, or ``nox -s sb3``.
+"""Run each trainer of ``examples/`` in its own environment: ``make trainers``, or ``nox -s sb3``.
 
-Arguments after ``--`` go to the examples: ``nox -s sb3 table -- --minutes 10 --items 1000000``.
+Arguments after ``--`` go to the examples: ``nox -s sb3 report -- --minutes 10 --items 1000000``.
 """
 
 import sys
@@ -23,23 +23,23 @@ EXAMPLES = {
 }
 IN_CI = ("torchrl", "rllib", "sb3", "tianshou")
 BRIEFLY = ("--items", "2500", "--episodes", "50")
-ACCOUNTS = Path("build/trainers")
+REPORTS = Path("build/trainers")
 CONSTRAINTS = Path(__file__).with_name("constraints.txt")
 TORCH = next(line for line in CONSTRAINTS.read_text().splitlines() if line.startswith("torch=="))
 
 
 def add(trainer: str, example: str) -> None:
-    """A session for one trainer."""
+    """Define the session of one trainer."""
 
     @nox.session(name=trainer, tags=["all", "ci"] if trainer in IN_CI else ["all"])
     def train(session: nox.Session) -> None:
-        account = ACCOUNTS / f"{trainer}.json"
-        account.unlink(missing_ok=True)
-        account.parent.mkdir(parents=True, exist_ok=True)
+        report = REPORTS / f"{trainer}.json"
+        report.unlink(missing_ok=True)
+        report.parent.mkdir(parents=True, exist_ok=True)
         extra = "" if trainer == "cleanrl" else f"[{trainer}]"
         session.install(TORCH, "-e", f".{extra}")
         arguments = session.posargs or BRIEFLY
-        session.run("python", f"examples/{example}.py", *arguments, "--json", str(account))
+        session.run("python", f"examples/{example}.py", *arguments, "--json", str(report))
 
 
 for trainer, example in EXAMPLES.items():
@@ -47,8 +47,8 @@ for trainer, example in EXAMPLES.items():
 
 
 @nox.session(venv_backend="none", tags=["all", "ci"])
-def table(session: nox.Session) -> None:
-    """What each trainer did when it was last run."""
+def report(session: nox.Session) -> None:
+    """Print what each trainer did when it was last run."""
     session.run(  # with nox's own Python: marl_pack is beside it
-        sys.executable, "-m", "marl_pack.integrations.table", str(ACCOUNTS), external=True
+        sys.executable, "examples/report.py", str(REPORTS), external=True
     )

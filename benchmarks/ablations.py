@@ -1,8 +1,8 @@
-"""What each agent, and each choice, brings: ``python -m benchmarks.ablations`` trains and compares.
+"""Measure what each agent and each choice brings: ``python -m benchmarks.ablations``.
 
 Every config in ``configs/ablations`` is trained with three seeds for the same number of items. With
 ``--config`` and ``--changes`` it is one config, each time with the options of one change. Runs that
-are there already are gone on with or just read. The figure of a run is its last evaluation, on the
+exist are resumed or just read. The figure of a run is its last evaluation, on the
 same held-out sequences for all; intervals are Student's over the seeds, and so is that of the
 difference to the first row, taken seed by seed.
 """
@@ -30,14 +30,14 @@ SEEDS = (0, 1, 2)
 
 
 def train(name: str, options: list[str], seed: int, folder: Path) -> Path:
-    """Train one run to its end, unless it is there; returns its folder."""
+    """Train one run to its end, unless it exists, and return its folder."""
     run = folder / f"{name}_{seed}"
     options = [*options, "--seed", str(seed), "--output.name", run.name,
                "--output.folder", str(folder)]  # fmt: skip
     command = [sys.executable, "-m", "marl_pack.train"]
     if (run / "latest.pt").is_file():
-        held = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
-        if held != parse(options)[0].to_dict():
+        settings = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        if settings != parse(options)[0].to_dict():
             raise SystemExit(f"{run}: was trained with other settings; give another --folder")
         command += ["--resume", str(run)]
     else:
@@ -71,8 +71,8 @@ def main() -> None:
     table: list[list[str]] = []
     first: NDArray[np.float64] | None = None
     for name, (config, change) in runs.items():
-        given = ["--config", str(config), *shlex.split(chosen.every), *shlex.split(change)]
-        last = [history(train(name, given, seed, chosen.folder))[-1] for seed in SEEDS]
+        arguments = ["--config", str(config), *shlex.split(chosen.every), *shlex.split(change)]
+        last = [history(train(name, arguments, seed, chosen.folder))[-1] for seed in SEEDS]
         u = np.array([row["utilization"] for row in last])
         first = u if first is None else first
         minutes = np.mean([row["seconds"] for row in last]) / 60

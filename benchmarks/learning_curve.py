@@ -1,7 +1,7 @@
-"""Utilization against items seen and against time: ``python -m benchmarks.learning_curve RUN …``.
+"""Draw utilization against items and against time: ``python -m benchmarks.learning_curve RUN …``.
 
 Reads the runs' ``evaluations.csv`` (a run's folder, or such a file, as models/ has them) and writes
-a picture; prints when each run passed the levels that others reach.
+a picture; prints when each run passed the levels of others.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ LEVELS = (
     ("the heuristic most_room", 75.9),
     ("random", 45.3),
 )
-"""Utilization on RS in per cent: the paper's, and other policies' of docs/results.md."""
+"""Utilization on RS in per cent: the paper's, and that of other policies in docs/results.md."""
 
 
 def history(run: Path) -> Any:
-    """The rows of a run's evaluations, as a structured array."""
+    """Return the rows of a run's evaluations, as a structured array."""
     path = run if run.is_file() else run / "evaluations.csv"
     return np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=float))
 
 
 def name_of(run: Path) -> str:
-    """What a run is called."""
+    """Return the name of a run's row."""
     return run.stem if run.is_file() else run.name
 
 
 def draw(runs: list[Path], path: Path, levels: Sequence[tuple[str, float]]) -> None:
-    """Two panels, over items and over minutes, a line a run with its 95 % interval."""
+    """Draw two panels, over items and over minutes, a line a run with its 95 % interval."""
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
@@ -47,7 +47,7 @@ def draw(runs: list[Path], path: Path, levels: Sequence[tuple[str, float]]) -> N
         for panel, x in zip(panels, (rows["items"] / 1e6, rows["seconds"] / 60), strict=True):
             panel.plot(x, 100 * rows["utilization"], label=name_of(run))
             panel.fill_between(x, 100 * rows["low"], 100 * rows["high"], alpha=0.2)
-    for panel, label in zip(panels, ("million items seen", "minutes on one core"), strict=True):
+    for panel, label in zip(panels, ("million items", "minutes on one core"), strict=True):
         for name, level in levels:
             panel.axhline(level, color="grey", linewidth=0.8, linestyle="--")
             panel.annotate(f"{name} {level}", (1, level), xycoords=("axes fraction", "data"),
@@ -60,12 +60,12 @@ def draw(runs: list[Path], path: Path, levels: Sequence[tuple[str, float]]) -> N
 
 
 def main() -> None:
-    """The picture and the table."""
+    """Draw the picture and print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.learning_curve")
     options.add_argument("runs", nargs="+", type=Path, help="runs' folders, or evaluations' files")
     options.add_argument("--picture", type=Path, default=Path("docs/learning_curve.png"))
     options.add_argument("--levels", action=argparse.BooleanOptionalAction, default=True,
-                         help="show what others reach on RS")  # fmt: skip
+                         help="show the levels of other policies on RS")  # fmt: skip
     chosen = options.parse_args()
     levels = LEVELS if chosen.levels else ()
     draw(chosen.runs, chosen.picture, levels)

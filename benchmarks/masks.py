@@ -1,8 +1,8 @@
-"""How fast are masks? ``python -m benchmarks.masks``.
+"""Time the masks of the stability rules: ``python -m benchmarks.masks``.
 
 1. One mask at 120 × 120 beside a literal reading of Algorithm 1: a loop over windows with
    ``cv2.convexHull`` and ``cv2.pointPolygonTest``. Timed is its cheapest reading, a point for each
-   cell; the masks are compared with the reading that marl_pack has, the cells' squares.
+   cell; the masks are compared with the reading of marl_pack, the cells' squares.
 2. Batched masks at 10 × 10, on every device.
 3. Cost against the grid's size.
 """
@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from benchmarks.states import LARGE, SMALL, in_play, random_items
 from benchmarks.timing import best_time, devices, show
-from marl_pack.stability import RULES, OrientedItem, hull_alpha, hull_cpu, make_rule, orient_item
+from marl_pack.stability import (
+    RULES,
+    OrientedItem,
+    hull_alpha,
+    hull_compiled,
+    make_rule,
+    orient_item,
+)
 from marl_pack.stability.reference import corners
 
 
@@ -27,7 +34,7 @@ def literal_algorithm_1(
     height: int,
     squares: bool,
 ) -> NDArray[np.bool_]:
-    """Algorithm 1, window by window, with OpenCV.
+    """Compute the mask of Algorithm 1, window by window, with OpenCV.
 
     Args:
         heightmap: [W, D].
@@ -48,13 +55,13 @@ def literal_algorithm_1(
             if top == 0:
                 mask[x, y] = True
                 continue
-            held = (window == top) & (empty_map[x : x + w, y : y + d] == 0)
-            if not held.any():
+            bearing = (window == top) & (empty_map[x : x + w, y : y + d] == 0)
+            if not bearing.any():
                 continue
             if squares:
-                points, centre = (2 * corners(held)).astype(np.int32), (float(w), float(d))
+                points, centre = (2 * corners(bearing)).astype(np.int32), (float(w), float(d))
             else:
-                points, centre = np.argwhere(held).astype(np.int32), (w / 2, d / 2)
+                points, centre = np.argwhere(bearing).astype(np.int32), (w / 2, d / 2)
             hull = cv2.convexHull(points)
             side = cv2.pointPolygonTest(hull, centre, False)
             mask[x, y] = side > 0 if squares else side >= 0
@@ -62,28 +69,28 @@ def literal_algorithm_1(
 
 
 def against_the_literal_reading(states: int = 32) -> None:
-    """Figure 1."""
+    """Print figure 1: one mask beside the literal reading."""
     size, sides = LARGE
     game = in_play(states, LARGE, steps=12)
     items = random_items(states, sides)
-    heights, gaps = game.bins.heightmap.numpy(), game.bins.empty_map.numpy()
+    heights, empty_maps = game.bins.heightmap.numpy(), game.bins.empty_map.numpy()
     seconds = dict.fromkeys(("literal", "mask", "kernel", "levels"), 0.0)
     for b in range(states):
         one = torch.tensor([b])
         bins, item = game.bins[one], OrientedItem(items[one][:, None])
         sides_b = tuple(items[b].tolist())
-        inputs = (heights[b], gaps[b], sides_b, size[2])
+        inputs = (heights[b], empty_maps[b], sides_b, size[2])
         exact = literal_algorithm_1(*inputs, squares=True)
         assert (hull_alpha(bins, item)[0, 0].numpy() == exact).all()
         seconds["literal"] += best_time(lambda i=inputs: literal_algorithm_1(*i, squares=False), 2)  # type: ignore[misc]  # bound now
         seconds["mask"] += best_time(lambda b=bins, i=item: hull_alpha(b, i))  # type: ignore[misc]  # bound now
-        levels = np.empty((1, *size[:2]), hull_cpu.level_dtype(size[2]))
+        levels = np.empty((1, *size[:2]), hull_compiled.level_dtype(size[2]))
         out = np.empty((1, 1, *size[:2]), np.uint8)
         maps = bins.heightmap.numpy(), bins.empty_map.numpy()
         arguments = (*maps, item.sides.numpy(), size[2], levels, out, levels[:0, None])
-        seconds["kernel"] += best_time(lambda a=arguments: hull_cpu.hull_mask(*a))  # type: ignore[misc]  # bound now
+        seconds["kernel"] += best_time(lambda a=arguments: hull_compiled.central_masks(*a))  # type: ignore[misc]  # bound now
         flat = (*(m.ravel() for m in maps), levels.ravel())
-        seconds["levels"] += best_time(lambda a=flat: hull_cpu.fill_levels(*a))  # type: ignore[misc]  # bound now
+        seconds["levels"] += best_time(lambda a=flat: hull_compiled.fill_levels(*a))  # type: ignore[misc]  # bound now
     mean = {name: value / states for name, value in seconds.items()}
     mean["alone"] = mean["kernel"] - mean["levels"]
     rows = [
@@ -103,11 +110,11 @@ def against_the_literal_reading(states: int = 32) -> None:
 
 
 def batched(n: int = 1024) -> None:
-    """Figure 2."""
+    """Print figure 2: batched masks of every rule."""
     rows = []
     for device in devices():
         game = in_play(n, SMALL, device=device)
-        item = game.orient_item(game.items, game.weights)
+        item = game.orient_item(game.items)
         for name in RULES:
             rule = make_rule(name)
             seconds = best_time(
@@ -120,13 +127,16 @@ def batched(n: int = 1024) -> None:
 
 
 def scaling() -> None:
-    """Figure 3: the items grow with the bin, from its 5th to half of it."""
+    """Print figure 3: masks against the grid.
+
+    The items grow with the bin, from its 5th to half of it.
+    """
     rows = []
     for side in (10, 20, 40, 80, 160):
         place = ((side, side, side), (side // 5, side // 2))
         n = max(8, 4096 * 100 // side**2)
         game = in_play(n, place, steps=20)
-        item = orient_item(game.items)
+        item = orient_item(game.items.sides)
         seconds = best_time(lambda g=game, i=item: hull_alpha(g.bins, i), 5)  # type: ignore[misc]  # bound now
         each = seconds / (6 * n)
         rows.append([f"{side} × {side}", f"{1e6 * each:.3f}", f"{1e9 * each / side**2:.2f}"])
@@ -134,7 +144,7 @@ def scaling() -> None:
 
 
 def main() -> None:
-    """All figures."""
+    """Print all three figures."""
     torch.set_num_threads(1)
     against_the_literal_reading()
     batched()

@@ -1,9 +1,9 @@
-"""What planning gains and takes: ``python -m benchmarks.planning models/rs.pt``.
+"""Measure what planning gains and costs: ``python -m benchmarks.planning models/rs.pt``.
 
 Plays the same generated sequences with each plan and prints mean utilization, the gain over the
 agents without a plan episode by episode, each with its 95 % interval, and the time of a decision:
-in the mean of the many bins that the evaluation plays at once, and for a single bin, as a robot
-waits for it. Wall time: leave the machine to it.
+on average over the many bins that the evaluation plays at once, and for a single bin, as a robot
+waits for it. These are wall times: run nothing else on the machine.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.timing import show
-from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.loading import Loader
 from marl_pack.agents.policy import Policy
-from marl_pack.agents.search import Plan, make_planner
-from marl_pack.evaluate import interval, play
+from marl_pack.agents.search import SearchSettings
+from marl_pack.evaluation.rollout import play
+from marl_pack.evaluation.statistics import interval
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
 
@@ -33,13 +35,13 @@ PLANS = (
 
 
 def spread(values: NDArray[np.float64]) -> str:
-    """Mean and half of its 95 % interval, in per cent of the bin."""
+    """Return the mean and half of its 95 % interval, in per cent of the bin."""
     low, high = interval(100 * values) or (np.nan, np.nan)
     return f"{100 * values.mean():+.2f} ± {(high - low) / 2:.2f}"
 
 
 def main() -> None:
-    """The table."""
+    """Play, and print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.planning")
     options.add_argument("checkpoint", type=Path, help="trained on generated RS")
     options.add_argument("--plans", nargs="+", default=PLANS, metavar="rollouts=K,top=M,depth=D")
@@ -50,8 +52,9 @@ def main() -> None:
                          help="ask the agents in all symmetries of the bin")  # fmt: skip
     chosen = options.parse_args()
     torch.set_num_threads(chosen.threads)
-    found = checkpoint.read(chosen.checkpoint)
-    settings = found["config"]["game"]
+    checkpoint = checkpoints.read(chosen.checkpoint)
+    loader = Loader(symmetric=chosen.symmetric)
+    settings = checkpoint["config"]["game"]
     size = tuple(settings["bin"])
     stream = make_stream("rs", size, tuple(settings["sides"]))
 
@@ -61,7 +64,7 @@ def main() -> None:
         )
 
     def alone(policy: Policy) -> float:
-        """Seconds of a decision for a single bin: the median over two episodes."""
+        """Return the seconds of a decision for a single bin: the median over two episodes."""
         taken = []
         for episode in range(3):
             bin_ = game(1, episode)
@@ -76,15 +79,15 @@ def main() -> None:
     table = []
     for text in ("", *chosen.plans):
         policy = (
-            make_planner(found, Plan.parse(text), stream, symmetric=chosen.symmetric) if text
-            else checkpoint.load_policy(found, symmetric=chosen.symmetric)
+            loader.planner(checkpoint, SearchSettings.parse(text), stream) if text
+            else loader.policy_of(checkpoint)
         )  # fmt: skip
-        played = play(policy, game, chosen.episodes)
-        reached = played.utilization
+        rollout = play(policy, game, chosen.episodes)
+        reached = rollout.utilization
         plain = reached if plain is None else plain
         table.append([
             text or "none", spread(reached).lstrip("+"), spread(reached - plain) if text else "",
-            f"{1000 * played.seconds / played.packed.sum():.1f}", f"{1000 * alone(policy):.1f}",
+            f"{1000 * rollout.seconds / rollout.packed.sum():.1f}", f"{1000 * alone(policy):.1f}",
         ])  # fmt: skip
         print(*table[-1], sep="  ", flush=True)
     show(

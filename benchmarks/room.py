@@ -1,21 +1,41 @@
-"""How fast is it told what placements leave? ``python -m benchmarks.room``.
+"""Time the afterstates of all legal placements: ``python -m benchmarks.room``.
 
 Every legal placement of the visible items in bins that random play has begun to fill: in how many
-cells each box that may come could be set down afterwards, by sets of cells as bits (floors of up to
+cells each box that may come could be placed afterwards, by sets of cells as bits (floors of up to
 128 cells), by compiled masks, and by tensor code.
 """
 
 from __future__ import annotations
 
-from unittest import mock
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import torch
 
 from benchmarks.timing import best_time, devices, show
-from marl_pack.agents.afterstates import bitboards
-from marl_pack.agents.afterstates.afterstates import _left_torch, afterstates_of, probe_lengths
+from marl_pack.agents.afterstates.afterstates import (
+    Afterstates,
+    afterstates_by_compiled_loops,
+    afterstates_of,
+    count_by_masks,
+    probe_lengths,
+)
+from marl_pack.agents.afterstates.bitboards import fit_in_words
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
+from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
+
+
+def seconds(
+    code: Callable[..., Afterstates], game: Packing, backend: Backend, device: str
+) -> float:
+    """Return the seconds that one call takes for the visible items of a game."""
+    bins = replace(game.bins.to(device), backend=backend)
+    sides = game.orient_item(game.items).sides.to(device)
+    mask, lengths = game.mask.to(device), probe_lengths(*game.stream.sides)
+    return best_time(lambda: code(bins, sides, mask, lengths), 5, device)
 
 
 def main() -> None:
@@ -27,25 +47,17 @@ def main() -> None:
         policy = make_policy("random", seed=1)
         for _ in range(6):
             game.place(*policy(game))
-        boxes = game.orient_item(game.items, game.weights).sides
-        lengths = probe_lengths(*game.stream.sides)
-        placements = len(afterstates_of(game.bins, boxes, game.mask, lengths).counts)
-
-        def seconds(code: object, device: str, game: Packing = game) -> float:
-            known = (
-                game.bins.to(device),
-                game.orient_item(game.items, game.weights).sides.to(device),
-            )
-            mask, reach = game.mask.to(device), probe_lengths(*game.stream.sides)
-            return best_time(lambda: code(*known, mask, reach), 5, device)  # type: ignore[operator]  # either code
-
-        with mock.patch.object(bitboards, "hold", return_value=False):
-            masks = seconds(afterstates_of, "cpu")
-        ways = [("compiled masks", "cpu", masks)]
-        if bitboards.hold(*size[:2]):
-            ways.insert(0, ("sets of bits", "cpu", seconds(afterstates_of, "cpu")))
-        ways += [("tensor code", device, seconds(_left_torch, device)) for device in devices()]
-        for name, device, time in ways:
+        placements = len(Lookahead().afterstates(game).counts)
+        by_masks = partial(afterstates_by_compiled_loops, count_cells=count_by_masks)
+        masks = seconds(by_masks, game, Backend.COMPILED, "cpu")
+        timings = [("compiled masks", "cpu", masks)]
+        if fit_in_words(*size[:2]):
+            bits = seconds(afterstates_of, game, Backend.COMPILED, "cpu")
+            timings.insert(0, ("sets of bits", "cpu", bits))
+        for device in devices():
+            time = seconds(afterstates_of, game, Backend.TENSOR, device)
+            timings.append(("tensor code", device, time))
+        for name, device, time in timings:
             rows.append(
                 [f"{size[0]}³, sides {sides[0]}-{sides[1]}", name, device,
                  f"{1e6 * time / placements:,.2f}", f"{1e6 * time / n:,.0f}",

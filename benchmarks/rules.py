@@ -1,8 +1,8 @@
-"""How large is each rule's mask beside the exact one? ``python -m benchmarks.rules``.
+"""Compare the size of each rule's mask with the exact one: ``python -m benchmarks.rules``.
 
 Counts cells over all six orientations of the visible item, summed over all decisions of games that
 are played under ``hull_alpha``. ``unsound`` is the share of a rule's cells that exact equilibrium
-refuses. Linear programs a decision: the cells that ``hull_1`` allows and ``hull_alpha`` does not.
+excludes. Linear programs a decision: the cells that ``hull_1`` allows and ``hull_alpha`` does not.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def compare(
     seconds = dict.fromkeys(RULES, 0.0)
     programs = between = 0
     for _ in range(steps):
-        item = game.orient_item(game.items, game.weights)
+        item = game.orient_item(game.items)
         masks = {}
         for name, rule in rules.items():
             start = time.process_time()
@@ -66,7 +66,7 @@ def compare(
 
 
 def main() -> None:
-    """All settings."""
+    """Print the table of every setting."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__)
     options.add_argument("--large-bins", type=int, default=24, help="bins at 120 × 120 × 120")
     chosen = options.parse_args()

@@ -19,7 +19,7 @@ import torch
 from benchmarks.timing import devices, show
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.config import parse
-from marl_pack.train import make_runner
+from marl_pack.training.assembly import make_runner
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 PARTS = ("game", "networks", "rsl_rl", "rest")

@@ -1,4 +1,4 @@
-"""Utilization against how different the items are: the paper's figure on the RS test sequences.
+"""Draw utilization against the spread of item volumes: the paper's figure, on RS test sequences.
 
 ``python -m benchmarks.volume_spread CHECKPOINT --items rs.npz`` plays every sequence, groups the
 episodes by the standard deviation of the volumes of their sequence's items and draws the mean
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.timing import show
-from marl_pack import evaluate
 from marl_pack.agents.heuristics import POLICIES
-from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.loading import Loader
 from marl_pack.bins import Size
+from marl_pack.evaluation.rollout import play
+from marl_pack.evaluation.statistics import interval
 from marl_pack.game.packing import Packing
 from marl_pack.items import Stream, choose_stream
 
@@ -29,7 +30,7 @@ GROUPS = 8
 
 
 def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float64]:
-    """Standard deviation of the item volumes of each sequence, cells³ [E].
+    """Return the standard deviation of the item volumes of each sequence, cells³ [E].
 
     Args:
         stream: a file's sequences, of which all items count.
@@ -41,26 +42,25 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
     assert longest is not None, "a file's sequences have an end"
     volumes = []
     for t in range(longest):
-        sides, _ = stream.item(state, torch.full((episodes,), t))
-        volumes.append(sides.long().prod(1))
-    found = torch.stack(volumes, 1).double()
-    found[found == 0] = torch.nan  # past the end of its sequence
-    return np.nanstd(found.numpy(), axis=1, ddof=1)
+        items = stream.item(state, torch.full((episodes,), t))
+        volumes.append(items.sides.long().prod(1))
+    table = torch.stack(volumes, 1).double()
+    table[table == 0] = torch.nan  # past the end of its sequence
+    return np.nanstd(table.numpy(), axis=1, ddof=1)
 
 
-def play(policy: str, stream: Stream, size: Size, episodes: int) -> NDArray[np.float64]:
-    """Utilization of each episode [E]."""
-    chosen = checkpoint.find_policy(policy, "cpu", 0)
+def utilization(policy: str, stream: Stream, size: Size, episodes: int) -> NDArray[np.float64]:
+    """Return the utilization of each episode [E]."""
+    chosen = Loader().policy(policy)
 
     def game(n: int, first: int) -> Packing:
         return Packing(n, size, stream, auto_reset=False, first_episode=first)
 
-    reached: NDArray[np.float64] = evaluate.play(chosen, game, episodes).utilization
-    return reached
+    return play(chosen, game, episodes).utilization
 
 
 def main() -> None:
-    """The picture and the table."""
+    """Draw the picture and print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.volume_spread")
     options.add_argument("policies", nargs="+", help="checkpoints, runs' folders or heuristics")
     options.add_argument("--items", required=True, help="a file of sequences")
@@ -80,22 +80,22 @@ def main() -> None:
     figure, panel = plt.subplots(figsize=(7, 4), layout="constrained")
     table: list[list[Any]] = []
     for p, policy in enumerate(chosen.policies):
-        reached = 100 * play(policy, stream, size, stream.episodes)
+        reached = 100 * utilization(policy, stream, size, stream.episodes)
         name = policy if policy in POLICIES else Path(policy).stem
         panel.scatter(spread, reached, s=2, alpha=0.15, color=f"C{p}")
         middle, mean, half = [], [], []
         for k in range(GROUPS):
             own = reached[group == k]
-            low, high = evaluate.interval(own) or (np.nan, np.nan)
+            low, high = interval(own) or (np.nan, np.nan)
             middle.append(np.median(spread[group == k]))
             mean.append(own.mean())
             half.append((high - low) / 2)
         panel.errorbar(middle, mean, half, marker="o", markersize=3, capsize=2, label=name,
                        color=f"C{p}")  # fmt: skip
-        found = stats.spearmanr(spread, reached)
+        rank = stats.spearmanr(spread, reached)
         slope = stats.linregress(spread, reached)
         table.append(
-            [name, f"{found.statistic:+.3f} (p = {found.pvalue:.2g})",
+            [name, f"{rank.statistic:+.3f} (p = {rank.pvalue:.2g})",
              f"{10 * slope.slope:+.2f} ± {19.6 * slope.stderr:.2f}",
              f"{mean[0]:.1f}", f"{mean[-1]:.1f}"]
         )  # fmt: skip

@@ -1,13 +1,13 @@
-"""BenchMARL: IPPO for both agents, through a task of our own.
+"""BenchMARL: IPPO for both agents, through a task.
 
 Versions: benchmarl 1.5, which needs an older TorchRL, and so an environment of its own:
     pip install ".[benchmarl]" && python examples/benchmarl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 29,696 items, utilization 58.9 → 71.6 %
 
 Traps:
-- BenchMARL's losses also run over the turns of the *other* agent. :class:`MaskedModel` gives
-  constant logits there, so that no gradient reaches the policy; the critic learns their values.
-- BenchMARL gives all environments of a task the same seed: :class:`Packing` counts instead.
+- BenchMARL's losses also run over the turns of the *other* agent. ``MaskedModel`` gives constant
+  logits there, so that no gradient reaches the policy; the critic learns their values.
+- BenchMARL gives all environments of a task the same seed: ``PackingTask`` counts instead.
 - Its PPO does not normalise advantages, which are small here: so is the entropy's weight.
 - A task keeps the mask from the model; here `observation_spec` shows it.
 """
@@ -15,90 +15,34 @@ Traps:
 import sys
 import tempfile
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import count
 from typing import Any
 
-import torch
 from benchmarl.algorithms import IppoConfig
-from benchmarl.environments.pettingzoo.common import PettingZooClass
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
-from benchmarl.models.common import Model, ModelConfig
-from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.benchmarl import MaskedModelConfig, PackingTask
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, current, run
+from session import Session, current, run
 
 
-class Packing(PettingZooClass):
-    """The AEC environment as a task: every agent is a group, with exact masks."""
+class Counted(PackingTask):
+    """The task with environments that the session counts."""
 
-    def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: Any, device: Any) -> Any:
-        """A function that makes one environment; each has its own items."""
-        seeds = count(1000 * (seed or 0))
-        return lambda: PettingZooWrapper(
-            current().env(), use_mask=True, seed=next(seeds), categorical_actions=True,
-            device=device,
-        )  # fmt: skip
-
-    def supports_discrete_actions(self) -> bool:
-        """Both agents' actions are discrete."""
-        return True
-
-    def max_steps(self, env: Any) -> int:
-        """In an evaluation; an episode ends by itself."""
-        return 10**6
-
-    def observation_spec(self, env: Any) -> Any:
-        """What the model reads: the planes, the mask of actions, and whether the agent acts."""
-        spec = env.observation_spec.clone()
-        for group in self.group_map(env):
-            del spec[group]["info"]
-        return spec
-
-
-class MaskedModel(Model):
-    """An :class:`ActorCritic` as BenchMARL wants it; as a critic it gives values."""
-
-    def __init__(self, **arguments: Any) -> None:
-        super().__init__(**arguments)
-        self.network = ActorCritic(self.agent_group.partition("_")[0])
-
-    def _forward(self, tensordict: Any) -> Any:
-        seen = tensordict[self.agent_group]
-        planes, mask = seen["observation", "observation"], seen["action_mask"]
-        lead = planes.shape[:-3]
-        logits, values = self.network(
-            planes.reshape(-1, *planes.shape[-3:]), mask.reshape(-1, mask.shape[-1])
-        )
-        if self.is_critic:
-            tensordict[self.out_key] = values.reshape(*lead, 1)
-        else:
-            acts = seen["mask"].reshape(*lead, 1)
-            tensordict[self.out_key] = torch.where(acts, logits.reshape(*lead, -1), 0)
-        return tensordict
-
-
-@dataclass
-class MaskedModelConfig(ModelConfig):
-    """Settings of :class:`MaskedModel`: none."""
-
-    @staticmethod
-    def associated_class() -> type[Model]:
-        """Whose settings these are."""
-        return MaskedModel
+    def make_env(self) -> Any:
+        """Return one new environment of the session."""
+        return current().env()
 
 
 class Enough(KeyboardInterrupt):
     """Ends an experiment before its time: BenchMARL closes it and lets this through."""
 
 
-class Account(Callback):
-    """Tells the session what BenchMARL has put down for the agents."""
+class Credit(Callback):
+    """Records in the session the rewards that BenchMARL stored for the agents."""
 
     def on_batch_collected(self, batch: Any) -> None:
-        """Take the rewards down."""
+        """Record the rewards of a batch; end training when there have been enough items."""
         for agent in AGENTS:
             current().credit(agent, batch["next", agent, "reward"].sum())
         print(f"{current().placed:,} items")
@@ -107,7 +51,7 @@ class Account(Callback):
 
 
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     settings = ExperimentConfig.get_from_yaml()
     settings.gamma, settings.lr, settings.clip_grad_val = 1.0, 1e-3, 1.0
     settings.on_policy_collected_frames_per_batch = session.turns
@@ -121,8 +65,8 @@ def train(session: Session) -> None:
     with tempfile.TemporaryDirectory() as folder:
         settings.save_folder = folder
         experiment = Experiment(
-            Packing("PACKING", {}), algorithm, MaskedModelConfig(), session.seed, settings,
-            callbacks=[Account()],
+            Counted("PACKING", {}), algorithm, MaskedModelConfig(), session.seed, settings,
+            callbacks=[Credit()],
         )  # fmt: skip
         session.watch(*(
             next(m for m in experiment.group_policies[a].modules() if isinstance(m, ActorCritic))

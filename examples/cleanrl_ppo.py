@@ -20,14 +20,14 @@ from torch.distributions import Categorical
 
 from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Counted, Session, run
+from session import Counted, Session, run
 
 EPOCHS, MINIBATCH, RATE, CLIP, LAMBDA = 4, 128, 1e-3, 0.2, 0.95
 
 
 @dataclass
 class Turns:
-    """What one agent saw and did."""
+    """Turns of one agent: observations, actions and rewards."""
 
     planes: list[Tensor] = field(default_factory=list)
     masks: list[Tensor] = field(default_factory=list)
@@ -38,16 +38,16 @@ class Turns:
     ends: list[bool] = field(default_factory=list)  # whether it was the agent's last turn
 
     def advantages(self) -> Tensor:
-        """GAE with γ = 1 over the agent's own turns; the last turn is an episode's end."""
-        found, after, value = [], 0.0, 0.0
+        """Compute GAE with γ = 1 over the agent's own turns; the last turn is an episode's end."""
+        advantages, after, value = [], 0.0, 0.0
         for k in reversed(range(len(self.actions))):
             if self.ends[k]:
                 after, value = 0.0, 0.0
             delta = self.rewards[k] + value - self.values[k]
             after = delta + LAMBDA * after
             value = self.values[k]
-            found.append(after)
-        return torch.tensor(found[::-1])
+            advantages.append(after)
+        return torch.tensor(advantages[::-1])
 
 
 def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) -> dict[str, Turns]:
@@ -57,13 +57,14 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
     while env.items < target:
         env.reset()
         for agent in env.agent_iter():
-            seen, reward, terminated, truncated, _ = env.last()
+            observation, reward, terminated, truncated, _ = env.last()
             own = turns[agent]
             if own.actions and not own.ends[-1]:
                 own.rewards[-1] = reward
                 own.ends[-1] = terminated or truncated
                 session.credit(agent, reward)
-            planes, mask = (torch.from_numpy(seen[k]) for k in ("observation", "action_mask"))
+            planes = torch.from_numpy(observation["observation"])
+            mask = torch.from_numpy(observation["action_mask"])
             with torch.no_grad():
                 logits, value = networks[agent](planes[None], mask[None])
             if truncated and own.actions:  # cut off, not at an end: more would have come
@@ -85,7 +86,7 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
 
 
 def learn(turns: Turns, network: ActorCritic, optimizer: torch.optim.Optimizer) -> None:
-    """PPO's epochs over one agent's turns."""
+    """Run PPO's epochs over one agent's turns."""
     planes, masks = torch.stack(turns.planes), torch.stack(turns.masks)
     actions, old = torch.tensor(turns.actions), torch.tensor(turns.log_probs)
     advantages = turns.advantages()
@@ -108,7 +109,7 @@ def learn(turns: Turns, network: ActorCritic, optimizer: torch.optim.Optimizer) 
 
 
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     env = session.env()
     env.reset(seed=session.seed)
     networks = {agent: ActorCritic(agent.partition("_")[0]) for agent in AGENTS}

@@ -5,8 +5,8 @@ Versions: ray 2.60:
     Ten minutes on a busy core: 52,565 items, utilization 46.3 → 72.2 %
 
 Traps:
-- Masks are the RLModule's business: :class:`MaskedModule` reads them from the observation. Its
-  `ValueFunctionAPI` is what the connectors ask for values with.
+- The RLModule has to apply masks: ``MaskedModule`` reads them from the observation. Connectors
+  ask for values through its `ValueFunctionAPI`.
 - Ray makes the environments from a pickled function, so what it closes over is a copy. Here all
   runs in one process (`num_env_runners=0`) and the function looks the session up.
 - A seed in `.debugging(seed=…)` would be given to *every* reset (with complete episodes), so that
@@ -18,56 +18,33 @@ Traps:
 import sys
 from typing import Any
 
-import torch
 from ray.rllib.algorithms.ppo import PPOConfig
-from ray.rllib.core.columns import Columns
-from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.wrappers.pettingzoo_env import PettingZooEnv
 from ray.tune.registry import register_env
 
 from marl_pack.env_aec import AGENTS
-from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, current, run
-
-
-class MaskedModule(TorchRLModule, ValueFunctionAPI):
-    """An :class:`ActorCritic` as RLlib wants it; ``model_config={"agent": "orientation"}``."""
-
-    def setup(self) -> None:
-        """Make the network."""
-        self.network = ActorCritic(self.model_config["agent"])
-
-    def _look(self, batch: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
-        seen = batch[Columns.OBS]
-        return self.network(seen["observation"], seen["action_mask"])
-
-    def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, torch.Tensor]:
-        return {Columns.ACTION_DIST_INPUTS: self._look(batch)[0]}
-
-    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> torch.Tensor:
-        """Values [B]."""
-        return self._look(batch)[1]
+from marl_pack.integrations.rllib import MaskedModule
+from session import Session, current, run
 
 
 def make_env(_: Any) -> PettingZooEnv:
-    """The environment, with its stream begun: whatever resets follow go on in it."""
+    """Return an environment whose stream has begun: the resets that follow go on in it."""
     env = current().env()
     env.reset(seed=current().seed)
     return PettingZooEnv(env)
 
 
 def credit(*, samples: list[Any], **_: Any) -> None:
-    """Tell the session what RLlib has put down for the agents."""
+    """Record in the session the rewards that RLlib stored for the agents."""
     for episode in samples:
         for agent, own in episode.agent_episodes.items():
             current().credit(agent, sum(own.get_rewards()))
 
 
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     register_env("packing", make_env)
     config = (
         PPOConfig()
@@ -97,8 +74,8 @@ def train(session: Session) -> None:
     algorithm = config.build_algo()
     session.watch(*(algorithm.get_module(agent).network for agent in AGENTS))
     while session.go_on():
-        found = algorithm.train()
-        reached = found["env_runners"]["agent_episode_returns_mean"][AGENTS[1]]
+        result = algorithm.train()
+        reached = result["env_runners"]["agent_episode_returns_mean"][AGENTS[1]]
         print(f"{session.placed:,} items, return {reached:.3f}")
     algorithm.stop()
 

@@ -7,7 +7,7 @@ Versions: skrl 2.1:
 Traps:
 - skrl takes PettingZoo's parallel API alone. `env_aec.parallel_env()` is turn-based, so its masks
   are exact; a conversion in which both act at once would show the placement agent a stale mask.
-- skrl knows no masks: the model has to apply them, as :class:`Masked` does.
+- skrl knows no masks: the model has to apply them, as ``MaskedModel`` does.
 - Both agents record every turn. In the other's turn nothing is legal, so all logits are equal and
   constant: no gradient reaches the policy from there, and the critic learns one more state's value.
 - The settings' empty dictionaries are refused (2.1): each has to name the agents.
@@ -20,51 +20,28 @@ from typing import Any
 from skrl import config
 from skrl.envs.wrappers.torch import wrap_env
 from skrl.memories.torch import RandomMemory
-from skrl.models.torch import CategoricalMixin, DeterministicMixin, Model
 from skrl.multi_agents.torch.ippo import IPPO, IPPO_CFG
 from skrl.trainers.torch import SequentialTrainer, SequentialTrainerCfg
-from skrl.utils.spaces.torch import unflatten_tensorized_space
 
 from marl_pack.env_aec import AGENTS
-from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, run
-
-
-class Masked(CategoricalMixin, DeterministicMixin, Model):
-    """An :class:`ActorCritic` as skrl wants it: policy and value in one."""
-
-    def __init__(self, agent: str, **spaces: Any) -> None:
-        Model.__init__(self, **spaces)
-        CategoricalMixin.__init__(self, role="policy")
-        DeterministicMixin.__init__(self, role="value")
-        self.network = ActorCritic(agent.partition("_")[0])
-
-    def act(self, inputs: dict[str, Any], *, role: str = "") -> Any:
-        """As the mixin of the role does."""
-        mixin = CategoricalMixin if role == "policy" else DeterministicMixin
-        return mixin.act(self, inputs, role=role)
-
-    def compute(self, inputs: dict[str, Any], role: str = "") -> Any:
-        """Masked logits [B, n], or values [B, 1]."""
-        seen = unflatten_tensorized_space(self.observation_space, inputs["observations"])
-        logits, values = self.network(seen["observation"], seen["action_mask"])
-        return (logits if role == "policy" else values[:, None]), {}
+from marl_pack.integrations.skrl import MaskedModel
+from session import Session, run
 
 
 class Credited(IPPO):
-    """Tells the session what skrl puts down for the agents."""
+    """Records in the session the rewards that skrl stores for the agents."""
 
     session: Session
 
     def record_transition(self, **transition: Any) -> None:
-        """Record a turn."""
+        """Record a turn and its rewards."""
         for agent, reward in transition["rewards"].items():
             self.session.credit(agent, reward)
         super().record_transition(**transition)
 
 
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     config.torch.device = "cpu"
     config.torch.key = session.seed  # of the items: the wrapper's first reset takes it
     env = wrap_env(session.parallel_env(), wrapper="pettingzoo")
@@ -76,7 +53,7 @@ def train(session: Session) -> None:
         }
         for agent in AGENTS
     }
-    models = {agent: Masked(agent, **spaces[agent]) for agent in AGENTS}
+    models = {agent: MaskedModel(agent, **spaces[agent]) for agent in AGENTS}
     none: dict[str, Any] = {agent: {} for agent in AGENTS}
     both = Credited(
         possible_agents=AGENTS,

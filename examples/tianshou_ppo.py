@@ -9,7 +9,7 @@ Traps:
 - Its multi-agent PPO takes every turn as a step of its own (its issue 399): the reward of a
   placement, which both agents get, would go to the placement agent alone, the orientation agent
   would see nothing but zeros and no end of an episode, and both would be valued by what the *other*
-  one sees next. :class:`Turns` gives each agent its own turns in a row instead.
+  one sees next. ``OwnTurns`` gives each agent its own turns in a row instead.
 - The collector has to play whole episodes, so that every turn has what followed, and the buffer to
   hold them all: what no longer fits would be overwritten from the front.
 """
@@ -18,83 +18,37 @@ import logging
 import sys
 from typing import Any
 
-import numpy as np
-import torch
 from tianshou.algorithm import PPO
 from tianshou.algorithm.modelfree.reinforce import DiscreteActorPolicy
-from tianshou.algorithm.multiagent.marl import MultiAgentOnPolicyAlgorithm
 from tianshou.algorithm.optim import AdamOptimizerFactory
-from tianshou.data import Batch, Collector, ReplayBuffer, VectorReplayBuffer
+from tianshou.data import Collector, VectorReplayBuffer
 from tianshou.env import DummyVectorEnv, PettingZooEnv
-from tianshou.utils.net.common import ActionReprNet
 from tianshou.utils.torch_utils import policy_within_training_step
-from torch import nn
 
 from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, run
+from marl_pack.integrations.tianshou import Actor, Critic, OwnTurns
+from session import Session, run
 
 BINS, EPOCHS, MINIBATCH, RATE = 8, 4, 128, 1e-3
 
 
-def look(network: ActorCritic, seen: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Logits and values of what Tianshou hands on."""
-    return network(torch.as_tensor(seen.obs), torch.as_tensor(seen.mask))
-
-
-class Actor(ActionReprNet):
-    """The network's logits."""
-
-    def __init__(self, network: ActorCritic) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, obs: Batch, state: Any = None, info: Any = None) -> tuple[torch.Tensor, Any]:
-        """Logits [B, n]."""
-        return look(self.network, obs)[0], state
-
-
-class Critic(nn.Module):
-    """The network's values."""
-
-    def __init__(self, network: ActorCritic) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, obs: Batch) -> torch.Tensor:
-        """Values [B]."""
-        return look(self.network, obs)[1]
-
-
-class Turns(MultiAgentOnPolicyAlgorithm):
-    """Each agent's turns as a run of its own, with all that it got until its next one."""
+class Credited(OwnTurns):
+    """Records in the session the rewards that the agents learn from."""
 
     def __init__(self, session: Session, **arguments: Any) -> None:
         super().__init__(**arguments)
         self.session = session
 
     def _preprocess_batch(self, batch: Any, buffer: Any, indices: Any) -> Any:
-        found = {}
-        for column, agent in enumerate(AGENTS):
-            own = np.flatnonzero(batch.obs.agent_id == agent)
-            other = np.minimum(own + 1, len(batch.done) - 1)  # the turn after it, if there is one
-            goes_on = ~batch.done[own] & (other > own)
-            rewards = batch.rew[own, column] + np.where(goes_on, batch.rew[other, column], 0)
-            self.session.credit(agent, rewards.sum())
-            turns = ReplayBuffer.from_data(
-                obs=batch.obs[own], act=batch.act[own], rew=rewards,
-                terminated=batch.terminated[own] | (goes_on & batch.terminated[other]),
-                truncated=batch.truncated[own] | (goes_on & batch.truncated[other]),
-                done=batch.done[own] | (goes_on & batch.done[other]),
-                obs_next=batch.obs_next[np.where(goes_on, other, own)],
-            )  # fmt: skip
-            every = np.arange(len(own))
-            found[agent] = self.get_algorithm(agent)._preprocess_batch(turns[every], turns, every)
-        return Batch(found)
+        batches = super()._preprocess_batch(batch, buffer, indices)
+        for agent in AGENTS:
+            self.session.credit(agent, batches[agent].rew.sum())
+        return batches
 
 
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     logging.getLogger("tianshou").setLevel(logging.ERROR)  # it warns of rewards for two agents
     games = DummyVectorEnv([lambda: PettingZooEnv(session.env(pad_actions=True))] * BINS)
     games.seed([session.seed * BINS + k for k in range(BINS)])
@@ -108,7 +62,7 @@ def train(session: Session) -> None:
         )
         for network in networks.values()
     ]  # fmt: skip
-    both = Turns(session, algorithms=learners, env=shown)
+    both = Credited(session, algorithms=learners, env=shown)
     session.watch(*networks.values())
     width, depth, height = session.bin_size
     most = 2 * width * depth * height // min(session.sides) ** 3  # turns of an episode
@@ -118,10 +72,10 @@ def train(session: Session) -> None:
     while session.go_on():
         with policy_within_training_step(both.policy):
             while len(buffer) < session.turns:
-                found = collector.collect(n_episode=BINS)  # one episode a bin
+                played = collector.collect(n_episode=BINS)  # one episode a bin
             both.update(buffer, batch_size=MINIBATCH, repeat=EPOCHS)
         collector.reset_buffer()
-        print(f"{session.placed:,} items, return {found.returns[:, 1].mean():.3f}")
+        print(f"{session.placed:,} items, return {played.returns[:, 1].mean():.3f}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ Versions: torchrl 0.14, which needs tensordict < 0.15 and so an environment of i
     Ten minutes on a busy core: 25,600 items, utilization 58.9 → 69.7 %
 
 Traps:
-- In the other's turn TorchRL's mask is full. :class:`Part` takes it as empty, so that logits are
+- In the other's turn TorchRL's mask is full. ``Part`` takes it as empty, so that logits are
   constant and no gradient reaches the policy from that turn; the critic learns its value.
 - GAE runs over all turns, so the critic has to be trained on all of them too.
 - `PettingZooWrapper(use_mask=True)` makes each agent of an AEC environment a group of its own.
@@ -16,7 +16,6 @@ import sys
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.collectors import Collector
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
@@ -26,42 +25,27 @@ from torchrl.objectives.value import GAE
 
 from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, run
+from marl_pack.integrations.torchrl import Part
+from session import Session, run
 
 EPOCHS, MINIBATCH, RATE = 4, 256, 1e-3  # in every second turn an agent acts
 
 
-class Part(torch.nn.Module):
-    """One of a network's two outputs, for any leading shape; TorchRL adds a dimension of agents."""
-
-    def __init__(self, network: ActorCritic, part: int) -> None:
-        super().__init__()
-        self.network, self.part = network, part
-
-    def forward(self, planes: Tensor, mask: Tensor, acts: Tensor) -> Tensor:
-        """Logits, or values."""
-        lead, legal = planes.shape[:-3], mask & acts[..., None]
-        out = self.network(
-            planes.reshape(-1, *planes.shape[-3:]), legal.reshape(-1, mask.shape[-1])
-        )
-        return out[self.part].reshape(*lead, -1)
-
-
 def train(session: Session) -> None:
-    """Train both agents."""
+    """Train both agents until the session has its items."""
     env = PettingZooWrapper(session.env(), use_mask=True, seed=session.seed)
     networks, actors, losses, advantages, optimizers = {}, {}, {}, {}, {}
     for agent in AGENTS:
         networks[agent] = ActorCritic(agent.partition("_")[0])
-        seen = [(agent, "observation", "observation"), (agent, "action_mask"), (agent, "mask")]
+        keys_in = [(agent, "observation", "observation"), (agent, "action_mask"), (agent, "mask")]
         actors[agent] = ProbabilisticActor(
-            TensorDictModule(Part(networks[agent], 0), seen, [(agent, "logits")]),
+            TensorDictModule(Part(networks[agent], 0), keys_in, [(agent, "logits")]),
             in_keys={"logits": (agent, "logits")}, out_keys=[(agent, "action")],
             distribution_class=Categorical, return_log_prob=True,
             log_prob_key=(agent, "log_prob"),
         )  # fmt: skip
         critic = TensorDictModule(
-            Part(ActorCritic(agent.partition("_")[0]), 1), seen, [(agent, "value")]
+            Part(ActorCritic(agent.partition("_")[0]), 1), keys_in, [(agent, "value")]
         )
         keys = {key: (agent, key) for key in
                 ("value", "advantage", "value_target", "reward", "done", "terminated")}  # fmt: skip
@@ -90,7 +74,7 @@ def train(session: Session) -> None:
 
 
 def learn(data: TensorDict, advantage: GAE, loss: ClipPPOLoss, optimizer: torch.optim.Adam) -> None:
-    """PPO's epochs of one agent."""
+    """Run PPO's epochs of one agent."""
     with torch.no_grad():
         data = advantage(data)
     for _ in range(EPOCHS):

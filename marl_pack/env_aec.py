@@ -1,8 +1,8 @@
 """Online 3D bin packing as a two-agent PettingZoo environment (AEC).
 
-A conveyor shows one box at a time. ``orientation_0`` turns it, then ``placement_0`` sets it into
-the bin, for good. Both share the reward. Masks hold exactly the actions after which nothing falls
-(Zhou et al. 2024, Algorithms 1 and 2). This module shows one bin of
+A conveyor shows one box at a time. ``orientation_0`` chooses how it lies, then ``placement_0``
+places it in the bin, for good. Both share the reward. Masks hold exactly the actions after which
+nothing falls (Zhou et al. 2024, Algorithms 1 and 2). This module is a view of one game of
 :class:`marl_pack.game.packing.Packing`; no rule of the game stands here.
 
 | | |
@@ -37,8 +37,10 @@ Version history: v0, first release.
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +57,10 @@ from pettingzoo.utils.conversions import (
 )
 
 from marl_pack.bins import ORIENTATIONS
-from marl_pack.game.packing import ALL_ORIENTATIONS, MOST_SKIPPED, Packing
-from marl_pack.items import DEFAULT_SIDES, Stream, check_items
-from marl_pack.stability import Rule
-from marl_pack.stability.oriented_item import NO_OFFSET
+from marl_pack.game.packing import MOST_SKIPPED, Packing
+from marl_pack.game.spec import GameSpec, document
+from marl_pack.items import DEFAULT_SIDES, Items, Stream
+from marl_pack.plan import Plan
 
 ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
 AGENTS = [ORIENTATION, PLACEMENT]
@@ -121,19 +123,15 @@ class Turns(turn_based_aec_to_parallel_wrapper):
         return returned
 
 
+@document(" " * 8)
 class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
     """One bin, two agents. See the module for agents, spaces, masks, reward and end.
 
     Args:
         bin_size: (W, D, H) in cells.
-        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array [L, 3] or [S, L, 3], or a stream.
+        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array [L, 3] or [S, L, 3], items with
+            attributes or a stream (:func:`marl_pack.items.make_stream`).
         sides: shortest and longest side of generated items.
-        rule: name of a stability rule (:data:`marl_pack.stability.RULES`) or a rule.
-        rule_parameters: what to bind to a named rule, e.g. ``{"margin": 1.0}``.
-        orientations: indices of the orientations that may be chosen.
-        alpha: weight of the volume gained, Eq. 5.
-        beta: weight of the space wasted, Eq. 5.
-        com_offset: the items' centre of mass from their geometric centre, in fractions of w, d, h.
         max_cycles: items after which an episode is truncated; None for no limit.
         render_mode: ``"rgb_array"`` (a picture), ``"human"`` (a window) or ``"ansi"`` (text).
         pad_actions: give both agents the same spaces: ``Discrete(max(6, W · D))``, masks filled up
@@ -142,9 +140,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             agent's info holds its ``action_mask``.
         illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; raises here);
             ``"repair"``: the nearest legal one is played and the actor's info says so.
+        **options: the other options of the game (``bin`` is ``bin_size`` here):
+        {options}
 
     Attributes:
         utilization: share of the bin filled, in [0, 1].
+        plan: what is packed (:class:`marl_pack.plan.Plan`).
 
     Raises:
         ValueError: if an argument cannot be, naming what would be right.
@@ -160,26 +161,19 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
     def __init__(
         self,
         bin_size: tuple[int, int, int] = (10, 10, 10),
-        items: str | Path | ArrayLike | Stream = "rs",
+        items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream = "rs",
         *,
         sides: tuple[int, int] = DEFAULT_SIDES,
-        rule: str | Rule = "hull_alpha",
-        rule_parameters: Mapping[str, Any] | None = None,
-        orientations: Sequence[int] = ALL_ORIENTATIONS,
-        alpha: float = 1.0,
-        beta: float = 1.0,
-        com_offset: tuple[float, float, float] = NO_OFFSET,
         max_cycles: int | None = None,
         render_mode: str | None = None,
         pad_actions: bool = False,
         mask_in: str = "observation",
         illegal: str = "terminate",
+        **options: Any,
     ) -> None:
         EzPickle.__init__(
-            self, bin_size, items, sides=sides, rule=rule, rule_parameters=rule_parameters,
-            orientations=orientations, alpha=alpha, beta=beta, com_offset=com_offset,
-            max_cycles=max_cycles, render_mode=render_mode, pad_actions=pad_actions,
-            mask_in=mask_in, illegal=illegal,
+            self, bin_size, items, sides=sides, max_cycles=max_cycles, render_mode=render_mode,
+            pad_actions=pad_actions, mask_in=mask_in, illegal=illegal, **options,
         )  # fmt: skip
         super().__init__()
         _one_of("mask_in", mask_in, ("observation", "info"))
@@ -190,12 +184,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             raise ValueError(f"max_cycles = {max_cycles}: needs at least 1, or None for no limit")
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
-        self._arguments: dict[str, Any] = {
-            "size": bin_size, "sides": sides, "rule": rule, "rule_parameters": rule_parameters,
-            "orientations": orientations, "alpha": alpha, "beta": beta, "com_offset": com_offset,
-            "auto_reset": False,
-        }  # fmt: skip
-        self._stream_game = Packing(1, items=items, **self._arguments)
+        self._spec = GameSpec(bin=bin_size).with_options(options)
+        self._stream_game = Packing(
+            1, items=items, spec=self._spec, sides=sides, auto_reset=False
+        )  # fmt: skip
         self._game = self._stream_game
         self._unit = max(self._game.size)
         self._episode = -1
@@ -222,7 +214,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self.state_space = spaces.Box(0.0, 1.0, (5, width, depth), np.float32)
         self._orientation_played = np.zeros(1, np.int64)
         self._cell_played = np.zeros(1, np.int64)
-        self._window: Any = None
+        self._window: Any = None  # opened by the first picture
+
+    @property
+    def plan(self) -> Plan:
+        """What is packed: the boxes placed so far in this episode, in their order."""
+        return self._game.plans()[0]
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The agent's observation space, the same object at each call."""
@@ -240,7 +237,8 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         Args:
             seed: begins the item stream anew from this seed. Without one the stream goes on to its
                 next episode (from a random seed if none was ever given).
-            options: ``{"items": array [L, 3]}`` plays that sequence once, whatever the stream.
+            options: ``{"items": …}`` plays that sequence once, whatever the stream: an array
+                [L, 3], or items with attributes.
 
         Raises:
             ValueError: for items that cannot be, or if no episode has a legal first item.
@@ -254,8 +252,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         if seed is not None:
             self._stream_game.seed, self._seeded, self._episode = int(seed), True, -1
         if options and options.get("items") is not None:
-            given = check_items(options["items"], self._game.size, source='options["items"]')
-            game = Packing(1, items=given, **self._arguments)
+            try:
+                game = Packing(1, items=options["items"], spec=self._spec, auto_reset=False)
+            except ValueError as error:
+                raise ValueError(f'options["items"]: {error}') from None
         else:
             game = self._stream_game
             for _ in range(MOST_SKIPPED):  # an episode may be over before it begins
@@ -265,7 +265,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
                     break
         if not bool(game.alive):
             raise ValueError(
-                f"the first item {game.items[0].tolist()} may be set down nowhere in the empty "
+                f"the first item {game.items.sides[0].tolist()} may be placed nowhere in the empty "
                 "bin: check orientations, the rule's margin and com_offset"
             )
         self._game = game
@@ -323,7 +323,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
 
     def _legal(self, agent: str, action: int | None) -> tuple[int, bool]:
-        """The action to play, and whether it had to be repaired."""
+        """Return the action to play, and whether it had to be repaired."""
         mask = self.action_mask(agent)
         if action is None or not 0 <= int(action) < len(mask):
             raise ValueError(f"{agent}: action {action} is not in 0 … {len(mask) - 1}")
@@ -336,24 +336,22 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             )
         if agent == ORIENTATION:
             return int(legal[np.abs(legal - int(action)).argmin()]), True
-        depth = self._game.size[1]
-        away = np.hypot(legal // depth - int(action) // depth, legal % depth - int(action) % depth)
-        return int(legal[away.argmin()]), True
+        return self._game.floor.nearest(int(action), legal), True
 
     # --- what is seen -----------------------------------------------------------------------------
 
     def _read_game(self) -> None:
-        """Take this cycle's numbers out of the game."""
+        """Read this cycle's numbers from the game."""
         game = self._game
         self._packed = int(game.bins.count.numpy()[0])
         self.utilization = int(game.bins.filled.numpy()[0]) / game.volume
         self._heights = game.bins.heightmap.numpy()[0] / np.float32(self._unit)
-        self._item = game.items.numpy()[0]
+        self._item = game.items.sides.numpy()[0]
         self._masks = game.mask.numpy()[0]
         self._orientation_mask = game.orientation_mask.numpy()[0]
 
     def _sides(self, turned: bool) -> NDArray[np.int16]:
-        """The item's sides: its own, or along x, y, z once (and if) it is turned."""
+        """Return the item's sides: its own, or along x, y, z once an orientation is chosen."""
         if turned and self._chosen is not None:
             return self._item[list(ORIENTATIONS[self._chosen])]
         return self._item
@@ -367,7 +365,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return planes
 
     def action_mask(self, agent: str) -> NDArray[np.int8]:
-        """The agent's legal actions; none when it is not its turn."""
+        """Return the agent's legal actions; none when it is not its turn."""
         mask = np.zeros(self.action_spaces[agent].n, np.int8)
         if agent == ORIENTATION and self._chosen is None:
             mask[: len(ORIENTATIONS)] = self._orientation_mask
@@ -385,20 +383,20 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return info
 
     def observe(self, agent: str) -> Any:
-        """What the agent sees now, whoever's turn it is, and after the end too."""
+        """Return what the agent observes now, whoever's turn it is, and after the end too."""
         planes = self._planes(agent == PLACEMENT, self.pad_actions)
         if self.mask_in == "info":
             return planes
         return {"observation": planes, "action_mask": self.action_mask(agent)}
 
     def state(self) -> NDArray[np.float32]:
-        """Float32 [5, W, D]: heightmap, the item as it lies now, and whose turn it is (0, 1)."""
+        """Return float32 [5, W, D]: heightmap, the item as it lies, and whose turn it is (0, 1)."""
         return self._planes(turned=True, whose_turn=True)
 
     # --- what a person sees -----------------------------------------------------------------------
 
     def render(self) -> NDArray[np.uint8] | str | None:
-        """The bin, the item to come and where it may go.
+        """Show the bin, the item to come and where it may go.
 
         Returns:
             uint8 [rows, columns, 3] for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
@@ -415,7 +413,11 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         image = self._picture()
         if self.render_mode == "rgb_array":
             return image
-        self._show(image)
+        if self._window is None:
+            from marl_pack.render.window import Window
+
+            self._window = Window()
+        self._window.show(image)
         return None
 
     def _title(self) -> str:
@@ -445,35 +447,31 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             self._title(),
         )
 
-    def _show(self, image: NDArray[np.uint8]) -> None:
-        from matplotlib import pyplot
-
-        if self._window is None:
-            figure, axes = pyplot.subplots(figsize=(image.shape[1] / 100, image.shape[0] / 100))
-            if figure.canvas.required_interactive_framework is None:
-                warnings.warn(
-                    "no display for render_mode='human': matplotlib found no window system; "
-                    "use render_mode='rgb_array' for pictures",
-                    stacklevel=3,
-                )
-            axes.set_position((0, 0, 1, 1))
-            axes.axis("off")
-            self._window = figure, axes.imshow(image)
-            figure.show(warn=False)
-        figure, picture = self._window
-        picture.set_data(image)
-        figure.canvas.draw_idle()
-        figure.canvas.flush_events()
-
     def close(self) -> None:
         """Close the window, if one was opened."""
         if self._window is not None:
-            from matplotlib import pyplot
-
-            pyplot.close(self._window[0])
+            self._window.close()
             self._window = None
 
 
 def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
     if value not in valid:
         raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")
+
+
+def _signature() -> inspect.Signature:
+    """Return the signature of :class:`raw_env` with every option of the game by its name."""
+    own = inspect.signature(raw_env.__init__)
+    listed = [p for name, p in own.parameters.items() if name not in ("self", "options")]
+    options = [
+        inspect.Parameter(
+            option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default,
+            annotation=option.type,
+        )
+        for option in fields(GameSpec)
+        if option.name != "bin"
+    ]  # fmt: skip
+    return own.replace(parameters=[*listed, *options], return_annotation=inspect.Signature.empty)
+
+
+raw_env.__signature__ = _signature()

@@ -1,9 +1,9 @@
 """Write a checkpoint's agents for use elsewhere: ONNX, or rsl_rl's own format.
 
 ``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
-the checkpoint, and ``AGENT_afterstates.onnx``, the critic of afterstates of an agent that hears
-one. Batch and bin size are free. The masks are inputs and are applied inside: an illegal action has
-probability 0 and is never the best.
+the checkpoint, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates. Batch and
+bin size are free. The masks are inputs and are applied inside: an illegal action has probability 0
+and is never the best.
 """
 
 from __future__ import annotations
@@ -12,17 +12,23 @@ import argparse
 import logging
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
 from torch import Tensor, nn
 
-from marl_pack.agents.afterstates.critic import FEATURES, AfterstateCritic
-from marl_pack.agents.learning import checkpoint
-from marl_pack.agents.networks.actor_critic import AGENTS, Actor
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.features import FEATURES
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.loading import load_actor, load_afterstate_critic
+from marl_pack.agents.networks.actor_critic import Actor
+from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.files import write_atomically
+from marl_pack.game.packing import Packing
 
 OPSET = 18
 
@@ -41,59 +47,36 @@ class Exported(nn.Module):
         self.distribution = actor.distribution
 
     def forward(self, *groups: Tensor) -> tuple[Tensor, Tensor]:
-        """The best action int64 [B], and the probability of each action [B, K]."""
-        seen = dict(zip(self.names, groups, strict=True))
-        logits = self.head(self.trunk(seen))
-        self.distribution.mask = seen["mask"]
+        """Return the best action int64 [B], and the probability of each action [B, K]."""
+        observation = dict(zip(self.names, groups, strict=True))
+        logits = self.head(self.trunk(observation))
+        self.distribution.mask = observation["mask"]
         logits = self.distribution.masked(logits)
         return logits.argmax(-1), logits.softmax(-1)
 
 
-def example(agent: str, planes: Sequence[str], batch: int, size: tuple[int, int, int]) -> dict[
-    str, Tensor
-]:  # fmt: skip
-    """An observation of an agent: random bins, all actions legal."""
-    width, depth, height = size
-    ways = AGENTS[agent].WAYS
-    shape = (batch, ways, width, depth)
-    generator = torch.Generator().manual_seed(0)
-
-    def draw(most: int, *dims: int) -> Tensor:
-        return torch.randint(0, most + 1, dims, generator=generator, dtype=torch.int64)
-
-    seen = {
-        "heightmap": draw(height, batch, width, depth),
-        "item": draw(2, batch, 3) + 1,
-        "height": torch.full((batch, 1), height),
+def example(agent: str, planes: Sequence[str]) -> dict[str, Tensor]:
+    """Return an observation of an agent in two games, whole numbers as int64."""
+    game = Packing(2, (7, 6, 8), sides=(2, 4))
+    kind = AGENT_KINDS[agent]
+    before = (game.orientation_mask.int().argmax(1),) if kind.orientations == 1 else ()
+    with torch.random.fork_rng(devices=[]):
+        lookahead = Lookahead(AfterstateCritic())
+    observation = observe(agent, game, planes, lookahead, *before)
+    whole = {torch.int16, torch.int32}
+    return {
+        name: values.long() if values.dtype in whole else values.clone()
+        for name, values in observation.items()
     }
-    actions = ways if agent == "orientation" else ways * width * depth
-    seen["mask"] = torch.ones(batch, actions, dtype=torch.bool)
-    if "mask" in planes:
-        seen["cells"] = torch.ones(shape, dtype=torch.bool)
-    if "rest" in planes:
-        seen["rest"] = draw(height, *shape)
-    if "waste" in planes:
-        seen["waste"] = draw(20, *shape)
-    for plane in ("room", "fits", "worth"):
-        if plane in planes:
-            seen[plane] = torch.rand(shape, generator=generator)
-            if plane != "fits":
-                seen[f"best_{plane}"] = torch.ones(batch, 1)
-    if "solid" in planes:
-        seen["solid"] = torch.ones(batch, width, depth, dtype=torch.bool)
-    if "filled" in planes:
-        seen["filled"] = torch.rand(batch, 1, generator=generator)
-    return seen
 
 
 def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
     """Write one agent as ONNX.
 
-    Inputs are the groups of the agent's ``observe``, whole numbers as int64: ``heightmap``
-    [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and ``cells`` bool,
-    ``rest``, ``waste``, float32 ``room``, ``fits``, ``worth`` [B, A, W, D], ``best_room``,
-    ``best_worth``, ``filled`` [B, 1], ``solid`` bool [B, W, D] where its network has these planes.
-    Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
+    Inputs are the tensors of the agent's observation
+    (:func:`marl_pack.agents.networks.kinds.observe`), whole numbers as int64: ``heightmap``
+    [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and those of the planes
+    that its network sees. Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
 
     Returns:
         The names of the inputs.
@@ -101,28 +84,22 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
     Raises:
         ModuleNotFoundError: if the packages of the extra ``export`` are missing.
     """
-    seen = example(agent, actor.cnns.planes, 2, (7, 6, 8))
-    names = list(seen)
+    observation = example(agent, actor.cnns.planes)
+    names = list(observation)
     batch, width, depth = (torch.export.Dim(name, min=1) for name in ("batch", "width", "depth"))
-    actions = 6 if agent == "orientation" else torch.export.Dim.DYNAMIC
-    shapes: dict[str, dict[int, object]] = {
-        "heightmap": {0: batch, 1: width, 2: depth},
-        "item": {0: batch},
-        "height": {0: batch},
-        "best_room": {0: batch},
-        "best_worth": {0: batch},
-        "filled": {0: batch},
-        "mask": {0: batch} if agent == "orientation" else {0: batch, 1: actions},
-    }
-    for plane in ("cells", "rest", "waste", "room", "fits", "worth"):
-        shapes[plane] = {0: batch, 2: width, 3: depth}
-    shapes["solid"] = shapes["heightmap"]
+    # The shape of a tensor says what is free in it, see marl_pack.agents.networks.planes.
+    free: dict[int, dict[int, object]] = {
+        2: {0: batch}, 3: {0: batch, 1: width, 2: depth}, 4: {0: batch, 2: width, 3: depth},
+    }  # fmt: skip
+    shapes = {name: free[values.dim()] for name, values in observation.items()}
+    if AGENT_KINDS[agent].acts_on_cells:
+        shapes["mask"] = {0: batch, 1: torch.export.Dim.DYNAMIC}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            Exported(actor, names).eval(), tuple(seen.values()), dynamo=True, opset_version=OPSET,
-            input_names=names, output_names=["action", "probabilities"], verbose=False,
-            dynamic_shapes=(tuple(shapes[name] for name in names),),
+            Exported(actor, names).eval(), tuple(observation.values()), dynamo=True,
+            opset_version=OPSET, input_names=names, output_names=["action", "probabilities"],
+            verbose=False, dynamic_shapes=(tuple(shapes[name] for name in names),),
         )  # fmt: skip
     _write(program, path)
     return names
@@ -131,8 +108,8 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
     """Write the critic of afterstates: ``features`` float32 [K, F] → ``value`` float32 [K].
 
-    What a placement is worth is its reward and this value of
-    :func:`marl_pack.agents.afterstates.critic.features`.
+    The value of a placement is its reward plus this value of the features of what it leaves
+    (:func:`marl_pack.agents.afterstates.features.features`).
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -150,8 +127,52 @@ def _write(program: torch.onnx.ONNXProgram | None, path: Path) -> None:
     write_atomically(path, lambda file: file.write(content))
 
 
+def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -> str:
+    """Write one agent of a checkpoint; return what is printed about it.
+
+    Args:
+        agent: its record.
+        name: of the agent.
+        folder: where to.
+        form: ``onnx`` or ``rsl_rl``.
+    """
+    if "network" not in agent:
+        return f"{name}: played by {agent['name']}, no network to export"
+    if form == "rsl_rl":
+        if "critic_state_dict" not in agent:
+            return f"{name}: was frozen, has no critic that rsl_rl could load"
+        path = folder / f"{name}.pt"
+        checkpoints.write(path, {k: v for k, v in agent.items() if k != "teacher"})
+        return f"{path}: for rsl_rl's PPO.load"
+    path = folder / f"{name}.onnx"
+    inputs = export_onnx(load_actor(agent, name, "cpu"), name, path)
+    return f"{path}: inputs {', '.join(inputs)}"
+
+
+def run(source: str, folder: Path | None, form: str, console: Console) -> None:
+    """Write every agent of a checkpoint, and its critic of afterstates.
+
+    Raises:
+        ValueError, OSError: if the checkpoint cannot be read or a file not written.
+    """
+    path = checkpoints.resolve(source)
+    checkpoint = checkpoints.read(path)
+    folder = folder or path.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, agent in checkpoint["agents"].items():
+        console.print(export_agent(agent, name, folder, form), soft_wrap=True)
+        own = load_afterstate_critic(agent, "cpu")
+        if own is not None and form == "onnx":  # a frozen agent's, of another run
+            export_afterstates(own, folder / f"{name}_afterstate_critic.onnx")
+    critic = load_afterstate_critic(checkpoint, "cpu")
+    if critic is not None and form == "onnx":
+        path = folder / "afterstate_critic.onnx"
+        export_afterstates(critic, path)
+        console.print(f"{path}: features of an afterstate to its value", soft_wrap=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command ``python -m marl_pack.export``."""
+    """Run the command ``python -m marl_pack.export``."""
     options = argparse.ArgumentParser(
         prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0]
     )
@@ -162,33 +183,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     options.add_argument("--folder", type=Path, help="where to (default: beside the checkpoint)")
     chosen = options.parse_args(arguments)
-    console = Console()
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
-        source = checkpoint.resolve(chosen.checkpoint)
-        found = checkpoint.read(source)
-        folder = chosen.folder or source.parent
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, agent in found["agents"].items():
-            if "network" not in agent:
-                console.print(f"{name}: played by {agent['name']}, no network to export")
-                continue
-            if chosen.format == "rsl_rl":
-                if "critic_state_dict" not in agent:
-                    console.print(f"{name}: was frozen, has no critic that rsl_rl could load")
-                    continue
-                path = folder / f"{name}.pt"
-                checkpoint.write(path, {k: v for k, v in agent.items() if k != "imitated"})
-                console.print(f"{path}: for rsl_rl's PPO.load", soft_wrap=True)
-                continue
-            path = folder / f"{name}.onnx"
-            actor = checkpoint.load_actor(found, name, "cpu")
-            inputs = export_onnx(actor, name, path)
-            console.print(f"{path}: inputs {', '.join(inputs)}", soft_wrap=True)
-            if actor.afterstates is not None:
-                path = folder / f"{name}_afterstates.onnx"
-                export_afterstates(actor.afterstates, path)
-                console.print(f"{path}: what {name} hears of placements", soft_wrap=True)
+        run(chosen.checkpoint, chosen.folder, chosen.format, Console())
     except ModuleNotFoundError as error:
         options.exit(2, f"{options.prog}: {error}; install marl_pack[export]\n")
     except (ValueError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Write files so that they are complete or do not exist."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_writable(path: Path) -> None:
 
 @contextmanager
 def moved_into_place(path: Path) -> Iterator[Path]:
-    """Where to write a file meanwhile, with the same ending; it is moved into place at the end."""
+    """Give a path with the same ending to write a file to; move the file into place at the end."""
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         yield part
@@ -32,7 +32,12 @@ def moved_into_place(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
-    """Write a file under another name and move it into place, so that it is whole or not there."""
+    """Write a file under another name and move it into place once it is complete.
+
+    Args:
+        path: of the file.
+        write: is called with the open binary file.
+    """
     with moved_into_place(path) as part, part.open("wb") as file:
         write(file)
         file.flush()
@@ -40,6 +45,6 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
 
 
 def write_json(path: Path, report: Any) -> None:
-    """Write figures as JSON; what it does not know is written as text, NaN is refused."""
+    """Write figures as JSON: unknown types as text, NaN refused with ValueError."""
     text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))

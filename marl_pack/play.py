@@ -1,7 +1,7 @@
 """Play one game, turn by turn, and draw the packed bin.
 
-``python -m marl_pack.play --policy models/rs.pt --picture play.png`` prints each item, how it was
-turned and where it went, then writes a picture of the bin at the end.
+``python -m marl_pack.play --policy models/rs.pt --picture play.png`` prints each item, its
+orientation and its place, then writes a picture of the bin at the end.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from rich.console import Console
 from rich.table import Table
 
 from marl_pack.bins import ORIENTATIONS
+from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.options import EPILOG, add_options, choose
-from marl_pack.stability import in_equilibrium
+from marl_pack.plan import Plan
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     options = argparse.ArgumentParser(
         prog="python -m marl_pack.play",
         description=__doc__.split("\n\n")[0],
@@ -37,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def run(chosen: argparse.Namespace, console: Console) -> None:
-    """Play the game the options ask for.
+    """Play the game the options ask for, print its turns and draw its end.
 
     Raises:
         ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
@@ -58,16 +59,16 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
         table.add_column(column, justify="right")
     while bool(game.alive):
-        item, count = game.items[0].tolist(), int(game.bins.count)
+        item, count = game.items.sides[0].tolist(), int(game.bins.count)
         orientation, cell = policy(game)
         outcome = game.place(orientation, cell)
         # Without a mask of orientations the one chosen may have no place, which ends the game.
         placed = int(outcome.placed) > count
-        turned = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
+        axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
         table.add_row(
             str(count + 1),
             " ".join(map(str, item)),
-            turned,
+            axes,
             " ".join(map(str, game.bins.boxes[0, count, :3].tolist())) if placed else "nowhere",
             f"{float(outcome.reward):+.3f}",
             f"{float(outcome.utilization):.1%}",
@@ -78,20 +79,17 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
     from marl_pack.render.picture import draw
 
-    bins = game.bins.to("cpu")
-    count = int(bins.count)
-    boxes, loads = bins.boxes[0, :count].numpy(), bins.loads[0, :count].numpy()
-    filled = int(bins.filled) / game.volume
-    stands = "in strict equilibrium" if in_equilibrium(boxes, loads) else "NOT in equilibrium"
-    ending = f"{count} boxes, utilization {filled:.1%}, {stands}"
+    plan = Plan.from_bins(game.bins.to("cpu"), 0)
+    balance = "in strict equilibrium" if strict_equilibrium(plan) else "NOT in equilibrium"
+    ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)
-    image = draw(game.size, boxes, title=f"{name}: {ending}")
+    image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
     write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
     console.print(f"picture: {chosen.picture}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command ``python -m marl_pack.play``."""
+    """Run the command ``python -m marl_pack.play``; return its exit status."""
     options = parser()
     chosen = options.parse_args(arguments)
     torch.set_num_threads(max(1, chosen.threads))

@@ -1,57 +1,49 @@
-"""N bins as a vectorized environment of rsl_rl.
-
-Each step of the game has two turns. ``get_observations`` shows the first, the orientation agent's;
-``orient`` shows the second, the placement agent's; ``step`` takes both choices.
-"""
+"""G games as a vectorized environment of rsl_rl."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.game.packing import Packing
 
 
 class PackingVecEnv(VecEnv):
-    """A game with ``auto_reset`` as rsl_rl's runner drives it.
+    """Games with ``auto_reset`` as rsl_rl's runner drives them, one item a step.
+
+    A step of the game has two turns. The runner sees the first one's observation; what the
+    placement agent observes depends on the orientation, so the algorithm asks the game for it.
 
     Args:
-        game: N bins.
-        planes: extra planes for each agent (:data:`marl_pack.agents.networks.trunk.PLANES`), by its
-        name.
-            With the key ``joint``, the first turn is the joint agent's and there is no second.
+        game: the games.
+        observe: the games → what the agent of the first turn observes.
         cfg: the run's settings, for the logger: an object with ``to_dict``.
 
     Raises:
-        ValueError: if the game does not begin new episodes by itself.
+        ValueError: if the games do not restart by themselves.
     """
 
     def __init__(
-        self, game: Packing, planes: Mapping[str, Sequence[str]], cfg: object = None
+        self,
+        game: Packing,
+        observe: Callable[[Packing], Mapping[str, Tensor]],
+        cfg: object = None,
     ) -> None:
         if not game.auto_reset:
             raise ValueError("a game for training needs auto_reset=True")
-        self.game, self.planes = game, dict(planes)
+        self.game, self.observe = game, observe
         self.num_envs, self.num_actions = game.n, 2
         self.device = game.device
         self.cfg = {} if cfg is None else cfg
         self.max_episode_length = game.bins.boxes.shape[1]
-        # Who says what placements are worth to agents that see it; PackingPPO teaches it.
-        self.afterstates: AfterstateCritic | None = None
-        if any("worth" in seen for seen in self.planes.values()):
-            self.afterstates = AfterstateCritic().to(self.device)
-        self._heightmap: Tensor | None = None  # the copy that this step's observations share
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Items placed in each bin, int64 [N]."""
+        """Items placed in each bin, int64 [G]."""
         return self.game.t
 
     @episode_length_buf.setter
@@ -59,41 +51,18 @@ class PackingVecEnv(VecEnv):
         raise ValueError("an episode cannot begin in its middle: leave init_at_random_ep_len False")
 
     def get_observations(self) -> TensorDict:
-        """What the first agent sees: groups as :func:`marl_pack.agents.orientation.observe`."""
-        if "joint" in self.planes:
-            seen = joint.observe(self.game, self.planes["joint"], self.afterstates)
-        else:
-            planes = self.planes.get("orientation", ())
-            seen = orientation.observe(self.game, planes, self.afterstates)
-        self._heightmap = seen["heightmap"]
-        return TensorDict(seen, batch_size=[self.num_envs], device=self.device)
-
-    def look_again(self, seen: TensorDict) -> None:
-        """Write into ``seen`` what is seen now that the critic of afterstates has learned."""
-        if self.afterstates is not None:
-            self.game.forget(self.afterstates)
-            with torch.inference_mode():
-                seen.update_(self.get_observations())
-
-    def orient(self, chosen: Tensor) -> TensorDict:
-        """What the placement agent sees: groups as :func:`marl_pack.agents.placement.observe`.
-
-        Args:
-            chosen: int64 [N], the orientations. Nothing changes: it may be called again.
-        """
-        seen = placement.observe(
-            self.game, self.planes.get("placement", ()), chosen, self._heightmap, self.afterstates
-        )
-        return TensorDict(seen, batch_size=[self.num_envs], device=self.device)
+        """Return what the agent of the first turn observes."""
+        observation = dict(self.observe(self.game))
+        return TensorDict(observation, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Set the items down.
+        """Place the items.
 
         Args:
-            actions: int64 [N, 2], orientation and cell, taken from the masks.
+            actions: int64 [G, 2], orientation and cell, taken from the masks.
 
         Returns:
-            The next observation, rewards float32 [N] (Eq. 5), dones uint8 [N] and extras: ``log``
+            The next observation, rewards float32 [G] (Eq. 5), dones uint8 [G] and extras: ``log``
             holds utilization and items of the episodes that have ended.
         """
         outcome = self.game.place(actions[:, 0], actions[:, 1], check=False)

@@ -4,12 +4,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from marl_pack import bins as state
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import Bins
 from marl_pack.game.packing import Packing
-from marl_pack.stability import Rule, orient_item
+from marl_pack.geometry import oriented
+from marl_pack.geometry.tensor import fits, resting_heights
+from marl_pack.stability import OrientedItem, Rule, orient_item
 
 torch.set_num_threads(1)
 
@@ -28,7 +31,7 @@ def stack(size: tuple[int, int, int], *boxes: tuple[int, int, int, int, int, int
     bins = state.empty(1, size, max_boxes=len(boxes) + 1)
     for x, y, z, w, d, h in boxes:
         rest, *_ = state.place(
-            bins, torch.tensor([[w, d, h]], dtype=torch.int16), torch.tensor([x * size[1] + y])
+            bins, torch.tensor([[w, d, h]], dtype=torch.int16), torch.tensor([[x, y]])
         )
         assert int(rest) == z, f"box {(x, y, z, w, d, h)} rests at {int(rest)}"
     return bins
@@ -46,7 +49,8 @@ def random_play(
         cell = torch.multinomial(
             allowed.float() + ~allowed.any(1, keepdim=True), 1, generator=generator
         )
-        state.place(bins, torch.where(allowed.any(1, keepdim=True), items, 0), cell[:, 0])
+        corner = torch.cat((cell // size[1], cell % size[1]), 1)
+        state.place(bins, torch.where(allowed.any(1, keepdim=True), items, 0), corner)
     return bins
 
 
@@ -56,18 +60,29 @@ def random_maps(
     """N bins in which boxes were dropped anywhere, standing or not."""
 
     def anywhere(bins: Bins, item) -> torch.Tensor:
-        from marl_pack.stability.hull_torch import fits, resting_height
-
-        rest = resting_height(bins.heightmap, item.sides)
-        room = rest + item.sides[..., 2, None, None] <= bins.height
-        flat = fits(item.sides.flatten(0, 1).long(), *bins.size[:2])
-        return room & flat.unflatten(0, item.sides.shape[:2])
+        top = resting_heights(bins.heightmap, item.sides) + item.sides[..., 2, None, None]
+        inside = fits(item.sides.flatten(0, 1).long(), *bins.size[:2])
+        return (top <= bins.height) & inside.unflatten(0, item.sides.shape[:2])
 
     return random_play(anywhere, n, size, sides, steps, seed)
 
 
 def boxes_of(bins: Bins, i: int) -> np.ndarray:
     return bins.boxes[i, : int(bins.count[i])].numpy()
+
+
+def some_items(n: int, sides: tuple[int, int], seed: int) -> Tensor:
+    """Items int16 [N, 3] with random sides."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
+
+
+def off_centre(items: Tensor, seed: int) -> OrientedItem:
+    """OrientedItem with a centre of mass anywhere in the middle half of each footprint."""
+    generator = torch.Generator().manual_seed(seed)
+    sides = oriented(items)
+    share = 0.25 + 0.5 * torch.rand(*sides.shape[:2], 2, generator=generator, dtype=torch.float64)
+    return OrientedItem(sides, share * sides[..., :2])
 
 
 def in_play(n: int, steps: int, **settings: object) -> Packing:

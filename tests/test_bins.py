@@ -4,7 +4,8 @@ import torch
 from conftest import boxes_of, random_maps, stack
 
 from marl_pack import bins as state
-from marl_pack.bins import ORIENTATIONS, oriented
+from marl_pack.backend import Backend
+from marl_pack.geometry import ORIENTATIONS, oriented
 
 
 def test_a_box_raises_its_footprint_and_counts_the_gap_below_it() -> None:
@@ -27,7 +28,7 @@ def test_gaps_under_gaps_add_up() -> None:
 def test_place_tells_resting_height_and_waste() -> None:
     bins = stack((6, 6, 9), (0, 0, 0, 3, 3, 4))
     rest, waste, volume = state.place(
-        bins, torch.tensor([[4, 2, 1]], dtype=torch.int16), torch.tensor([1 * 6 + 2])
+        bins, torch.tensor([[4, 2, 1]], dtype=torch.int16), torch.tensor([[1, 2]])
     )
     assert int(rest) == 4
     assert int(volume) == 8
@@ -47,28 +48,31 @@ def test_heightmap_minus_empty_map_is_what_the_boxes_fill() -> None:
 def test_a_zero_sided_box_changes_nothing() -> None:
     bins = stack((4, 4, 4), (0, 0, 0, 2, 2, 2))
     before = bins.clone()
-    state.place(bins, torch.zeros(1, 3, dtype=torch.int16), torch.tensor([0]))
+    state.place(bins, torch.zeros(1, 3, dtype=torch.int16), torch.tensor([[0, 0]]))
     for now, then in zip(bins.tensors(), before.tensors(), strict=True):
         assert torch.equal(now, then)
 
 
-def test_tensor_code_places_as_the_compiled_code_does() -> None:
-    generator = torch.Generator().manual_seed(1)
-    one = state.empty(40, (6, 9, 20), max_boxes=15)
-    other = one.clone()
-    for step in range(15):
-        sides = torch.randint(0, 5, (40, 3), generator=generator).short()
-        x, y = (torch.randint(0, s - 3, (40,), generator=generator) for s in (6, 9))
-        weights = torch.rand(40, generator=generator) if step % 2 else None
-        com = torch.rand(40, 2, generator=generator).double() if step % 3 else None
-        told = state._place_cpu(one, sides, x * 9 + y, weights, com)
-        again = state._place_torch(other, sides, x * 9 + y, weights, com)
-        for a, b in zip(told, again, strict=True):
-            assert torch.equal(a.long(), b.long())
-    held = torch.arange(15) < one.count[:, None]
-    for a, b in zip(one.tensors(), other.tensors(), strict=True):
-        same = a == b
-        assert same.all() if a.shape[:2] != held.shape else same[held].all()
+def test_labels_are_kept_with_the_boxes_and_unknown_by_default() -> None:
+    bins = state.empty(2, (4, 4, 9), max_boxes=2)
+    boxes = torch.tensor([[2, 2, 1], [1, 3, 2]], dtype=torch.int16)
+    state.place(
+        bins,
+        boxes,
+        torch.tensor([[0, 0], [1, 1]]),
+        labels=(torch.tensor([7, 8]), torch.tensor([3, 0])),
+    )
+    state.place(bins, boxes, torch.tensor([[2, 2], [0, 0]]))
+    assert bins.labels.tolist() == [[[7, 3], [-1, -1]], [[8, 0], [-1, -1]]]
+    assert bins.for_boxes(5).labels.shape == (2, 5, 2)
+    assert torch.equal(bins[torch.tensor([1])].labels, bins.labels[1:])
+
+
+def test_a_view_of_other_bins_has_the_same_backend() -> None:
+    bins = state.empty(3, (4, 4, 9), max_boxes=2, backend=Backend.TENSOR)
+    for other in (bins[:2], bins.clone(), bins.to("cpu"), bins.for_boxes(9)):
+        assert other.backend is Backend.TENSOR
+    assert state.empty(1, (4, 4, 9)).backend is Backend.COMPILED
 
 
 def test_orientations_are_the_six_permutations_in_turned_pairs() -> None:
@@ -97,13 +101,16 @@ def test_cleared_bins_are_empty_and_the_others_untouched() -> None:
         assert torch.equal(now, then)
 
 
-def test_a_full_bin_and_a_box_outside_are_refused() -> None:
-    bins = stack((2, 2, 9), (0, 0, 0, 2, 2, 1))
+@pytest.mark.parametrize("backend", Backend)
+def test_a_full_bin_and_a_box_outside_are_refused(backend: Backend) -> None:
+    bins = state.empty(1, (2, 2, 9), max_boxes=1, backend=backend)
     box = torch.tensor([[1, 1, 1]], dtype=torch.int16)
-    state.place(bins, box, torch.tensor([0]))
+    state.place(bins, box, torch.tensor([[0, 0]]))
     with pytest.raises(ValueError, match="full"):
-        state.place(bins, box, torch.tensor([0]))
-    for cell in (-1, 4, 3):
+        state.place(bins, box, torch.tensor([[0, 0]]))
+    for corner, depth in (((-1, 0), 1), ((0, -1), 1), ((2, 0), 1), ((1, 1), 2)):
+        bins = state.empty(1, (2, 2, 9), backend=backend)
         with pytest.raises(ValueError, match="out of the map"):
-            wide = torch.tensor([[1, 1 + (cell == 3), 1]], dtype=torch.int16)
-            state.place(state.empty(1, (2, 2, 9)), wide, torch.tensor([cell]))
+            wide = torch.tensor([[1, depth, 1]], dtype=torch.int16)
+            state.place(bins, wide, torch.tensor([corner]))
+        assert not bins.heightmap.any()

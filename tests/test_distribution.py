@@ -8,7 +8,7 @@ import torch
 from marl_pack.agents.networks.distribution import MaskedCategorical
 
 
-def made(logits: list[list[float]], mask: list[list[bool]]) -> MaskedCategorical:
+def distribution_of(logits: list[list[float]], mask: list[list[bool]]) -> MaskedCategorical:
     distribution = MaskedCategorical()
     distribution.mask = torch.tensor(mask)
     distribution.update(torch.tensor(logits))
@@ -17,7 +17,7 @@ def made(logits: list[list[float]], mask: list[list[bool]]) -> MaskedCategorical
 
 def test_probabilities_are_those_of_the_legal_actions_alone() -> None:
     # e^0 : e^ln3 = 1 : 3; the illegal middle one has the largest logit
-    d = made([[0.0, 50.0, math.log(3)]], [[True, False, True]])
+    d = distribution_of([[0.0, 50.0, math.log(3)]], [[True, False, True]])
     assert torch.allclose(d.log_probs.exp(), torch.tensor([[0.25, 0.0, 0.75]]))
     assert d.log_probs.exp()[0, 1] == 0
     chosen = torch.tensor([[2.0]])
@@ -26,7 +26,7 @@ def test_probabilities_are_those_of_the_legal_actions_alone() -> None:
 
 
 def test_entropy_and_kl_by_hand() -> None:
-    d = made([[0.0, 7.0, math.log(3)]], [[True, False, True]])
+    d = distribution_of([[0.0, 7.0, math.log(3)]], [[True, False, True]])
     entropy = -(0.25 * math.log(0.25) + 0.75 * math.log(0.75))
     assert d.entropy.item() == pytest.approx(entropy, rel=1e-6)
     assert d.std.item() == pytest.approx(math.sqrt(1 - 0.25**2 - 0.75**2), rel=1e-6)
@@ -50,7 +50,7 @@ def test_gradients_of_illegal_actions_are_zero_and_all_are_finite() -> None:
 
 
 def test_a_row_without_a_legal_action_stays_finite() -> None:
-    d = made([[1.0, 2.0], [1.0, 2.0]], [[False, False], [True, False]])
+    d = distribution_of([[1.0, 2.0], [1.0, 2.0]], [[False, False], [True, False]])
     old = d.params
     assert torch.isfinite(d.entropy).all()
     assert torch.isfinite(d.log_prob(torch.tensor([[1.0], [0.0]]))).all()

@@ -165,7 +165,7 @@ def test_planes_show_heights_and_the_turned_item() -> None:
 @pytest.mark.parametrize("arguments", VARIANTS)
 def test_the_environment_plays_the_batched_game_step_by_step(arguments: dict[str, Any]) -> None:
     env = env_aec.env(**arguments)
-    core = {"size": arguments.get("bin_size", (10, 10, 10))}
+    core = {"bin": arguments.get("bin_size", (10, 10, 10))}
     core |= {k: arguments[k] for k in ("items", "sides", "rule") if k in arguments}
     game = Packing(1, **core, auto_reset=False, seed=5)
     generator = np.random.default_rng(5)
@@ -411,10 +411,10 @@ def test_whose_turn_it_is_stands_in_every_info() -> None:
 
 
 def test_a_refused_reset_leaves_the_game_as_it_was() -> None:
-    env = env_aec.raw_env(rule_parameters={"margin": 1.0}, sides=(3, 5))
+    env = env_aec.raw_env(margin=1.0, sides=(3, 5))
     env.reset(seed=0)
     before = env.state()
-    with pytest.raises(ValueError, match="set down nowhere"):
+    with pytest.raises(ValueError, match="placed nowhere"):
         env.reset(options={"items": [[2, 2, 2]]})
     assert (env.state() == before).all()
 
@@ -436,8 +436,8 @@ def test_an_episode_that_cannot_begin_is_skipped() -> None:
 
 
 def test_a_first_item_without_a_place_is_refused_at_reset() -> None:
-    env = env_aec.env(rule_parameters={"margin": 4.0})
-    with pytest.raises(ValueError, match="may be set down nowhere"):
+    env = env_aec.env(margin=4.0)
+    with pytest.raises(ValueError, match="may be placed nowhere"):
         env.reset(seed=0)
 
 

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,12 @@ import pytest
 from marl_pack import evaluate, train
 from marl_pack import play as play_command
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.evaluate import Episodes, load_stacks, strict_equilibrium, summary
+from marl_pack.evaluation import rollout
+from marl_pack.evaluation.rollout import Rollout
+from marl_pack.evaluation.statistics import strict_equilibrium, summary
 from marl_pack.game.packing import Packing
+from marl_pack.plan import Plan
+from marl_pack.plan_archive import load_plans
 
 
 def test_the_table_the_json_and_the_stacks_agree(
@@ -20,39 +25,42 @@ def test_the_table_the_json_and_the_stacks_agree(
     assert evaluate.main([*arguments, "--json", str(out), "--save-stacks", str(stacks)]) == 0
     report = json.loads(out.read_text())
     row = report["policies"]["dblf"]
-    played = load_stacks(stacks)
-    assert row["episodes"] == len(played.utilization) == 40
-    assert row["utilization"] == pytest.approx(played.utilization.mean())
-    assert row["packed"] == pytest.approx(played.packed.mean())
+    plans = load_plans(stacks)
+    assert row["episodes"] == len(plans) == 40
+    assert row["utilization"] == pytest.approx(np.mean([plan.utilization for plan in plans]))
+    assert row["packed"] == pytest.approx(np.mean([len(plan) for plan in plans]))
     assert row["strict_equilibrium"] == 1.0
     assert report["settings"]["seed"] == 3
     assert f"{100 * row['utilization']:.2f}" in capsys.readouterr().out
     # The stacks hold the boxes that make the utilization.
-    volume = played.boxes[..., 3:].astype(int).prod(2).sum(1)
-    assert (volume / 1000 == played.utilization).all()
-    assert ((played.boxes[..., 3] > 0).sum(1) == played.packed).all()
+    with np.load(stacks) as archive:
+        boxes, count = archive["boxes"], archive["count"]
+        volume = boxes[..., 3:].astype(int).prod(2).sum(1)
+        assert (volume / 1000 == archive["utilization"]).all()
+        assert (archive["utilization"] == [plan.utilization for plan in plans]).all()
+        assert ((boxes[..., 3] > 0).sum(1) == count).all()
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_what_is_played_does_not_depend_on_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    def played() -> Episodes:
-        return evaluate.play(
+    def play() -> Rollout:
+        return rollout.play(
             make_policy("best_fit"),
             lambda n, first: Packing(n, seed=1, first_episode=first, auto_reset=False),
             25,
         )
 
-    whole = played()
-    monkeypatch.setattr(evaluate, "BATCH", 7)
-    parts = played()
+    whole = play()
+    monkeypatch.setattr(rollout, "BATCH", 7)
+    parts = play()
+    assert len(whole.plans) == 25
     assert (whole.utilization == parts.utilization).all()
-    assert (whole.boxes == parts.boxes).all()
-    assert (whole.loads == parts.loads).all()
+    assert whole.plans == parts.plans
 
 
 def test_progress_counts_every_episode_once() -> None:
     counted: list[int] = []
-    evaluate.play(
+    rollout.play(
         make_policy("random"),
         lambda n, first: Packing(n, first_episode=first, auto_reset=False),
         30,
@@ -61,43 +69,53 @@ def test_progress_counts_every_episode_once() -> None:
     assert sum(counted) == 30
 
 
+def filled(height: int, boxes: int) -> Plan:
+    """A bin of 10³ with so many plates, filled up to a height."""
+    rows = [(0, 0, k, 10, 10, 1) for k in range(boxes - 1)]
+    return Plan.of_boxes((10, 10, 10), [*rows, (0, 0, boxes - 1, 10, 10, height - boxes + 1)])
+
+
 def test_the_summary_is_as_worked_by_hand() -> None:
-    played = Episodes(
-        (10, 10, 10),
-        np.array([0.5, 0.6, 0.7]),
-        np.array([5, 6, 10]),
-        np.zeros((3, 1, 6), np.int16),
-        np.zeros((3, 1, 3)),
-        seconds=3.0,
-    )
+    played = Rollout([filled(5, 5), filled(6, 2), filled(7, 5)], seconds=3.0)
     figures = summary(played, np.array([True, True, False]))
     assert figures["utilization"] == pytest.approx(0.6)
     assert figures["std"] == pytest.approx(0.1)
     # Student's t with two degrees of freedom: 4.3027 · 0.1 / √3
     assert figures["interval"] == pytest.approx([0.6 - 0.24841, 0.6 + 0.24841], abs=1e-4)
-    assert figures["packed"] == pytest.approx(7)
-    assert figures["decisions_per_second"] == pytest.approx(7)
+    assert figures["packed"] == pytest.approx(4)
+    assert figures["decisions_per_second"] == pytest.approx(4)
     assert figures["strict_equilibrium"] == pytest.approx(2 / 3)
 
 
 def test_equal_episodes_have_an_interval_of_no_width() -> None:
-    played = Episodes(
-        (9, 9, 9), np.full(3, 0.3), np.full(3, 2), np.zeros((3, 2, 6), np.int16),
-        np.zeros((3, 2, 3)), 1.0,
-    )  # fmt: skip
-    figures = summary(played, np.ones(3, np.bool_))
+    figures = summary(Rollout([filled(3, 2)] * 3, 1.0), np.ones(3, np.bool_))
     assert figures["interval"] == [0.3, 0.3]
     assert figures["std"] == 0
 
 
-def test_a_stack_that_falls_is_counted() -> None:
-    boxes = np.zeros((2, 2, 6), np.int16)
-    boxes[0] = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 4, 2, 1)]  # balanced on the edge
-    boxes[1] = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 3, 2, 1)]
-    loads = np.array([[(8, 1, 1), (8, 2, 1)], [(8, 1, 1), (6, 1.5, 1)]], np.float64)
-    count = np.array([2, 2])
-    played = Episodes((9, 9, 9), np.zeros(2), count, boxes, loads, 1.0)
-    assert strict_equilibrium(played).tolist() == [False, True]
+def test_a_stack_that_falls_is_no_equilibrium() -> None:
+    balanced = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 4, 2, 1)]  # on the edge
+    falls = Plan.of_boxes((9, 9, 9), balanced, [(8, 1, 1), (8, 2, 1)])
+    stands = Plan.of_boxes((9, 9, 9), [balanced[0], (0, 0, 2, 3, 2, 1)], [(8, 1, 1), (6, 1.5, 1)])
+    assert [strict_equilibrium(plan) for plan in (falls, stands)] == [False, True]
+
+
+def test_every_bin_of_a_plan_has_to_stand() -> None:
+    rows = np.array([(0, 0, 0, 2, 2, 2), (0, 0, 0, 2, 2, 2), (0, 0, 2, 3, 2, 1)])
+    for last, stands in ((0, False), (1, True)):  # in bin 0 the last box is on nothing
+        plan = Plan(
+            np.full((2, 3), 9), np.array([1, 1, last]), rows[:, :3], rows[:, 3:], np.zeros(3, int),
+            np.ones(3), rows[:, :2] + rows[:, 3:5] / 2, ("",) * 3,
+        )  # fmt: skip
+        if stands:
+            plan = replace(plan, positions=np.array([(0, 0, 0), (5, 5, 0), (0, 0, 2)]),
+                           centres=np.array([(1, 1), (6, 6), (1.5, 1)]))  # fmt: skip
+        assert strict_equilibrium(plan) == stands
+
+
+def test_fractions_of_a_unit_are_not_judged_as_cells() -> None:
+    with pytest.raises(ValueError, match="whole numbers"):
+        strict_equilibrium(Plan.of_boxes((9, 9, 9), [(0, 0, 0, 2.5, 2, 2)]))
 
 
 def test_no_rule_but_a_sound_one_keeps_every_stack_standing(tmp_path: Path) -> None:
@@ -171,12 +189,12 @@ def test_a_single_episode_has_no_interval(tmp_path: Path) -> None:
     assert row["std"] is None
 
 
-def test_episodes_that_cannot_begin_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_that_cannot_begin_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate.main(["--margin", "1", "--episodes", "40"]) == 0
-    assert "may be set down nowhere" in " ".join(capsys.readouterr().out.split())
+    assert "may be placed nowhere" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_checkpoints_own_game_is_played_unless_told_otherwise(
+def test_a_checkpoints_own_game_is_played_unless_options_change_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--ppo.max_iterations=1", "--ppo.num_envs=8", "--ppo.num_mini_batches=2",
@@ -185,10 +203,10 @@ def test_a_checkpoints_own_game_is_played_unless_told_otherwise(
                "--game.com_offset=[0.05,0,0]", "--output.name=run"]  # fmt: skip
     assert train.main([*options, f"--output.folder={tmp_path}"]) == 0
     run, out = str(tmp_path / "run"), tmp_path / "out.json"
-    given = ["--policy", run, "random", "--episodes", "4", "--json", str(out)]
+    command = ["--policy", run, "random", "--episodes", "4", "--json", str(out)]
 
     def settings(*more: str) -> dict[str, object]:
-        assert evaluate.main([*given, *more]) == 0
+        assert evaluate.main([*command, *more]) == 0
         report: dict[str, object] = json.loads(out.read_text())["settings"]
         return report
 
@@ -199,18 +217,11 @@ def test_a_checkpoints_own_game_is_played_unless_told_otherwise(
     assert own["thresholds"] == "code"
     assert own["orientations"] == [0, 1]
     assert own["com_offset"] == [0.05, 0, 0]
-    told = " ".join(capsys.readouterr().out.split())
-    assert "rule area_ratio (thresholds code), orientations 0 1, centre of mass off by" in told
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "rule area_ratio, thresholds code, orientations 0 1, centre of mass off by" in shown
     other = settings("--rule", "hull_alpha", "--bin", "8", "8", "8", "--items", "cut2")
     assert (other["rule"], other["thresholds"]) == ("hull_alpha", None)
     assert (other["bin"], other["sides"], other["items"]) == ([8, 8, 8], [1, 3], "cut2")
-
-
-def test_a_foreign_file_of_stacks_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.npz"
-    np.savez(path, other=np.zeros(3))
-    with pytest.raises(ValueError, match="not a file of stacks"):
-        load_stacks(path)
 
 
 def test_play_shows_the_game_and_draws_it(
@@ -221,21 +232,21 @@ def test_play_shows_the_game_and_draws_it(
     text = capsys.readouterr().out
     assert "in strict equilibrium" in text
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    for wrong, said in (
+    for wrong, why in (
         (["--picture", "bin.xyz"], "ending .png"),
         (["--policy", "dblf", "random", "--picture", str(path)], "one plays here"),
         (["--episode", "-1", "--picture", str(path)], "needs 0"),
     ):
         with pytest.raises(SystemExit):
             play_command.main(wrong)
-        assert said in capsys.readouterr().err
+        assert why in capsys.readouterr().err
 
 
 def test_play_shows_where_a_choice_without_a_cell_ends_the_game(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     items = tmp_path / "items.csv"
-    items.write_text("episode,w,d,h\n0,4,4,1\n0,4,1,4\n", encoding="utf-8")
+    items.write_text("sequence,w,d,h\n0,4,4,1\n0,4,1,4\n", encoding="utf-8")
     command = ["--orientation", "first", "--placement", "dblf", "--no-orientation-mask",
                "--items", str(items), "--bin", "4", "4", "4",
                "--picture", str(tmp_path / "x.png")]  # fmt: skip

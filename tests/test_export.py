@@ -1,4 +1,4 @@
-"""ONNX files say what PyTorch says, for any batch and bin size."""
+"""ONNX files compute what PyTorch computes, for any batch and bin size."""
 
 from pathlib import Path
 
@@ -6,81 +6,125 @@ import numpy as np
 import pytest
 import torch
 
-from marl_pack.agents.afterstates.critic import AfterstateCritic, features
-from marl_pack.agents.learning import checkpoint
-from marl_pack.agents.networks.actor_critic import make_actor
-from marl_pack.agents.networks.trunk import PLANES
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.features import FEATURES, features
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.networks.actor_critic import Actor, make_actor
+from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.agents.networks.planes import PLANES
 from marl_pack.export import Exported, export_afterstates, export_onnx, main
 from marl_pack.game.packing import Packing
+from marl_pack.train import main as train
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
 
-@pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
-@pytest.mark.parametrize("planes", [(), PLANES])
+def varied_actor(agent: str, network: dict[str, object]) -> Actor:
+    """Return an actor whose probabilities differ clearly between actions."""
+    torch.manual_seed(0)
+    actor = make_actor(agent, network, "cpu").eval()
+    for weight in actor.mlp.parameters():
+        weight.data.mul_(30)  # else a fresh network is almost uniform
+    return actor
+
+
+def check_file(path: Path, actor: Actor, agent: str, names: list[str], game: Packing) -> None:
+    """Assert that the file and the actor agree in games that have begun."""
+    session = onnxruntime.InferenceSession(str(path))
+    assert [i.name for i in session.get_inputs()] == names
+    for _ in range(3):
+        orientation = game.orientation_mask.int().argmax(1)
+        game.place(orientation, game.orient(orientation).mask.flatten(1).int().argmax(1))
+    before = [game.orientation_mask.int().argmax(1)] if agent == "placement" else []
+    lookahead = Lookahead(AfterstateCritic())
+    observation = observe(agent, game, actor.cnns.planes, lookahead, *before)
+    assert list(observation) == names
+    with torch.inference_mode():
+        action, probabilities = Exported(actor, names)(*observation.values())
+    inputs = {name: values.numpy() for name, values in observation.items()}
+    for name, values in inputs.items():
+        if np.issubdtype(values.dtype, np.integer):
+            inputs[name] = values.astype(np.int64)
+    outputs = session.run(["action", "probabilities"], inputs)
+    assert np.array_equal(outputs[0], action.numpy())
+    np.testing.assert_allclose(outputs[1], probabilities.numpy(), atol=1e-5)
+    assert (outputs[1][~observation["mask"].numpy()] == 0).all()
+
+
+@pytest.mark.parametrize("agent", AGENT_KINDS)
+@pytest.mark.parametrize("planes", [(), tuple(PLANES)])
 def test_an_exported_agent_agrees_with_pytorch(
     agent: str, planes: tuple[str, ...], tmp_path: Path
 ) -> None:
-    torch.manual_seed(0)
     network = {"channels": 8, "layers": 3, "context": True, "planes": list(planes)}
-    actor = make_actor(agent, network, "cpu").eval()
-    for weight in actor.mlp.parameters():
-        weight.data.mul_(30)  # else the first network is almost uniform
+    actor = varied_actor(agent, network)
     path = tmp_path / "agent.onnx"
     names = export_onnx(actor, agent, path)
-    session = onnxruntime.InferenceSession(str(path))
-    assert [i.name for i in session.get_inputs()] == names
     for n, size in ((1, (5, 5, 5)), (7, (10, 8, 12)), (3, (13, 13, 6))):
-        game = Packing(n, size, sides=(2, 4), seed=n)
-        for _ in range(3):
-            chosen = game.orientation_mask.int().argmax(1)
-            game.place(chosen, game.orient(chosen).mask.flatten(1).int().argmax(1))
-        chosen = [game.orientation_mask.int().argmax(1)] if agent == "placement" else []
-        seen = actor.see(game, *chosen)
-        with torch.inference_mode():
-            action, probabilities = Exported(actor, names)(*(seen[name] for name in names))
-        given = {name: seen[name].numpy() for name in names}
-        for name, values in given.items():
-            if np.issubdtype(values.dtype, np.integer):
-                given[name] = values.astype(np.int64)
-        out = session.run(["action", "probabilities"], given)
-        assert np.array_equal(out[0], action.numpy())
-        np.testing.assert_allclose(out[1], probabilities.numpy(), atol=1e-5)
-        assert (out[1][~seen["mask"].numpy()] == 0).all()
+        check_file(path, actor, agent, names, Packing(n, size, sides=(2, 4), seed=n))
+
+
+@pytest.mark.parametrize("plane", PLANES)
+def test_an_agent_with_one_plane_is_exported(plane: str, tmp_path: Path) -> None:
+    actor = varied_actor("placement", {"channels": 4, "layers": 1, "planes": [plane]})
+    path = tmp_path / "agent.onnx"
+    names = export_onnx(actor, "placement", path)
+    check_file(path, actor, "placement", names, Packing(3, (9, 8, 7), sides=(2, 4)))
 
 
 def test_an_exported_critic_of_afterstates_agrees_with_pytorch(tmp_path: Path) -> None:
     critic = AfterstateCritic()
     export_afterstates(critic, tmp_path / "afterstates.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "afterstates.onnx"))
-    game = Packing(3)
+    game, lookahead = Packing(3), Lookahead()
     for _ in range(4):
-        seen = features(game.left(), game.volume)
-        value = session.run(["value"], {"features": seen.numpy()})[0]
-        np.testing.assert_allclose(value, critic(seen).detach().numpy(), atol=1e-6)
-        chosen = game.orientation_mask.int().argmax(1)
-        game.place(chosen, game.orient(chosen).mask.flatten(1).int().argmax(1))
+        inputs = features(lookahead.afterstates(game), game.volume)
+        value = session.run(["value"], {"features": inputs.numpy()})[0]
+        np.testing.assert_allclose(value, critic(inputs).detach().numpy(), atol=1e-6)
+        orientation = game.orientation_mask.int().argmax(1)
+        game.place(orientation, game.orient(orientation).mask.flatten(1).int().argmax(1))
+
+
+SMALL = (
+    "--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
+    "--ppo.max_iterations=1", "--evaluation.every=0",
+)  # fmt: skip
 
 
 def test_the_command_writes_every_learned_agent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from marl_pack.train import main as train
-
-    options = ["--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
-               "--ppo.max_iterations=1", "--evaluation.every=0", f"--output.folder={tmp_path}",
-               "--output.name=run", "--orientation.frozen=true", "--orientation.policy=first",
-               "--placement.network.planes=[worth]", "--placement.imitate=dblf",
-               "--placement.imitate_iterations=5"]  # fmt: skip
+    options = [*SMALL, f"--output.folder={tmp_path}", "--output.name=run",
+               "--orientation.frozen=true", "--orientation.policy=first",
+               "--placement.network.planes=[afterstate_value]", "--placement.teacher=dblf",
+               "--placement.teacher_iterations=5"]  # fmt: skip
     assert train(options) == 0
     assert main([str(tmp_path / "run")]) == 0
     assert "orientation: played by first" in capsys.readouterr().out
     assert (tmp_path / "run" / "placement.onnx").is_file()
-    assert (tmp_path / "run" / "placement_afterstates.onnx").is_file()
+    assert (tmp_path / "run" / "afterstate_critic.onnx").is_file()
     assert main([str(tmp_path / "run"), "--format", "rsl_rl", "--folder", str(tmp_path / "o")]) == 0
     state = torch.load(tmp_path / "o" / "placement.pt", weights_only=True)
-    found = checkpoint.read(tmp_path / "run")
-    assert state.keys() == found["agents"]["placement"].keys() - {"imitated"}
+    agent = checkpoints.read(tmp_path / "run")["agents"]["placement"]
+    assert "teacher" in agent
+    assert state.keys() == agent.keys() - {"teacher"}
     with pytest.raises(SystemExit):
         main([str(tmp_path / "nowhere")])
     assert "no such checkpoint" in capsys.readouterr().err
+
+
+def test_a_frozen_networks_own_critic_is_written_beside_the_runs(tmp_path: Path) -> None:
+    run, folder = "--output.name=run", f"--output.folder={tmp_path}"
+    planes = "--placement.network.planes=[afterstate_value]"
+    assert train([*SMALL, folder, "--output.name=first", planes]) == 0
+    frozen = ("--placement.frozen=true", f"--placement.policy={tmp_path / 'first'}")
+    planes = "--orientation.network.planes=[afterstate_value]"
+    assert train([*SMALL, folder, run, planes, *frozen]) == 0
+    assert main([str(tmp_path / "run")]) == 0
+    inputs = np.random.default_rng(0).random((3, FEATURES), np.float32)
+    values = []
+    for name in ("afterstate_critic", "placement_afterstate_critic"):
+        session = onnxruntime.InferenceSession(str(tmp_path / "run" / f"{name}.onnx"))
+        values.append(session.run(["value"], {"features": inputs})[0])
+    assert not np.allclose(*values)

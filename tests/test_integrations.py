@@ -1,4 +1,4 @@
-"""What other people's trainers get from us: the network, and the account of what they did."""
+"""What other people's trainers use: the network, and the compliance report of what they did."""
 
 import importlib.util
 import json
@@ -15,11 +15,14 @@ from pettingzoo.utils.wrappers import BaseWrapper
 from marl_pack import env_aec
 from marl_pack.env_aec import AGENTS
 from marl_pack.integrations.network import ActorCritic
-from marl_pack.integrations.session import Session, current, run
-from marl_pack.integrations.table import main as show_table
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
+sys.path.insert(0, str(EXAMPLES))  # as if an example ran
+
+from report import main as show_reports  # noqa: E402
+from session import Session, current, run  # noqa: E402
+
 SMALL = [
     "--bin",
     "5",
@@ -53,10 +56,12 @@ def test_the_network_gives_legal_actions_alone_for_any_bin(size: tuple[int, int,
         env.reset(seed=0)
         networks = {a: ActorCritic("both" if padded else a.partition("_")[0]) for a in AGENTS}
         for agent in env.agent_iter(8):
-            seen, _, terminated, _, _ = env.last()
+            observation, _, terminated, _, _ = env.last()
             if terminated:
                 break
-            planes, mask = (torch.as_tensor(seen[k])[None] for k in ("observation", "action_mask"))
+            planes, mask = (
+                torch.as_tensor(observation[k])[None] for k in ("observation", "action_mask")
+            )
             logits, value = networks[agent](planes, mask)
             assert logits.shape == mask.shape
             assert value.shape == (1,)
@@ -64,12 +69,12 @@ def test_the_network_gives_legal_actions_alone_for_any_bin(size: tuple[int, int,
             env.step(int(logits.argmax()))
 
 
-def test_an_example_in_cleanrls_style_fits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_example_in_cleanrls_style_passes(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("CleanRL's style", "marl_pack", example("cleanrl_ppo").train, SMALL) == 0
-    assert capsys.readouterr().out.strip().endswith("fits")
+    assert capsys.readouterr().out.strip().endswith("passes")
 
 
-def test_a_trainer_that_does_not_fit_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trainer_that_does_not_pass_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     def train(session: Session) -> None:
         session.watch(ActorCritic("orientation"), ActorCritic("placement"))
         env = session.env()
@@ -80,13 +85,13 @@ def test_a_trainer_that_does_not_fit_is_told(capsys: pytest.CaptureFixture[str])
         env.step(int(cells.argmin()))  # not legal, nothing learned, nothing credited
 
     assert run("nobody", "marl_pack", train, SMALL) == 1
-    told = capsys.readouterr()
-    assert "illegal: 1" in told.out
-    assert "'orientation_0': False" in told.out
-    assert "DOES NOT FIT" in told.err
+    printed = capsys.readouterr()
+    assert "illegal: 1" in printed.out
+    assert "'orientation_0': False" in printed.out
+    assert "DOES NOT PASS" in printed.err
 
 
-def test_rewards_put_down_wrongly_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_rewards_stored_wrongly_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     def train(session: Session) -> None:
         assert current() is session
         example("cleanrl_ppo").train(session)
@@ -96,10 +101,10 @@ def test_rewards_put_down_wrongly_are_told(capsys: pytest.CaptureFixture[str]) -
     assert "rewards_right: {'orientation_0': False, 'placement_0': True}" in capsys.readouterr().out
 
 
-def test_items_that_repeat_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_items_that_repeat_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     def train(session: Session) -> None:
-        made = session.env
-        session.env = lambda **options: Seeded(made(**options))  # type: ignore[method-assign]  # on purpose
+        new_env = session.env
+        session.env = lambda **options: Seeded(new_env(**options))  # type: ignore[method-assign]  # on purpose
         example("cleanrl_ppo").train(session)
 
     class Seeded(BaseWrapper):
@@ -113,13 +118,13 @@ def test_items_that_repeat_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert "repeats: 0" not in capsys.readouterr().out
 
 
-def test_an_agent_whose_critic_alone_learns_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_agent_whose_critic_alone_learns_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     def train(session: Session) -> None:
         cleanrl = example("cleanrl_ppo")
         learn = cleanrl.learn
 
         def only_values(turns: Any, network: ActorCritic, optimizer: Any) -> None:
-            head = network.turns.weight
+            head = network.orientations.weight
             head.requires_grad_(network.agent != "orientation")
             learn(turns, network, optimizer)
 
@@ -133,40 +138,41 @@ def test_an_agent_whose_critic_alone_learns_is_told(capsys: pytest.CaptureFixtur
 def test_the_parallel_view_is_counted_as_well() -> None:
     session = Session([*SMALL, "--seed", "3"])
     env = session.parallel_env()
-    seen, _ = env.reset(seed=0)
+    observations, _ = env.reset(seed=0)
     rewards = dict.fromkeys(AGENTS, 0.0)
     while env.agents:
-        seen, got, _, _, _ = env.step({a: int(seen[a]["action_mask"].argmax()) for a in AGENTS})
-        rewards = {a: rewards[a] + got[a] for a in AGENTS}
+        actions = {a: int(observations[a]["action_mask"].argmax()) for a in AGENTS}
+        observations, step, _, _, _ = env.step(actions)
+        rewards = {a: rewards[a] + step[a] for a in AGENTS}
     assert session.placed > 1
     assert session.envs[0].totals == pytest.approx(rewards)
     assert session.envs[0].illegal == 0
 
 
-def test_accounts_make_a_table(
+def test_reports_make_a_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "cleanrl.json"
     train = example("cleanrl_ppo").train
     assert run("CleanRL's style", "marl_pack", train, [*SMALL, "--json", str(file)]) == 0
-    monkeypatch.setattr(sys, "argv", ["table", str(tmp_path)])
-    assert show_table() == 0
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path)])
+    assert show_reports() == 0
     shown = capsys.readouterr().out.splitlines()[-2]
-    account = json.loads(file.read_text())
-    before, after = (f"{100 * account[k][0]:.1f} ± {100 * account[k][1]:.1f} %"
+    report = json.loads(file.read_text())
+    before, after = (f"{100 * report[k][0]:.1f} ± {100 * report[k][1]:.1f} %"
                      for k in ("before", "after"))  # fmt: skip
     assert "CleanRL's style" in shown
     assert "5 × 5 × 5" in shown
-    assert f"  {account['items']}  " in shown
+    assert f"  {report['items']}  " in shown
     assert before in shown
     assert after in shown
 
-    file.write_text(json.dumps(account | {"illegal": 1}))
-    assert show_table() == 1
+    file.write_text(json.dumps(report | {"illegal": 1}))
+    assert show_reports() == 1
     file.unlink()
     with pytest.raises(SystemExit):
-        show_table()
-    assert "no account there" in capsys.readouterr().err
+        show_reports()
+    assert "no report there" in capsys.readouterr().err
 
 
 def test_one_episode_has_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
@@ -177,7 +183,7 @@ def test_one_episode_has_no_interval(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_every_example_is_run_and_can_be_installed() -> None:
     sessions = example("noxfile", ROOT).EXAMPLES
-    assert set(sessions.values()) == {file.stem for file in EXAMPLES.glob("*.py")}
+    assert set(sessions.values()) == {file.stem for file in EXAMPLES.glob("*ppo.py")}
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]

@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -6,17 +7,28 @@ import pytest
 import torch
 from scipy import stats
 
+from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
-from marl_pack.items import Uniform, check_items, cut, independent, load, make_stream
+from marl_pack.items import (
+    ATTRIBUTES,
+    Items,
+    Sequences,
+    Uniform,
+    check_items,
+    cut,
+    fingerprint,
+    independent,
+    load,
+    make_stream,
+)
 from marl_pack.items.random_numbers import below, episode_keys, mix
-from marl_pack.items.streams import _uniform_items
 
 BIN = (10, 10, 10)
 
 
 def sequence(stream, seed: int, episode: int, length: int) -> list[list[int]]:
     state = stream.start(seed, torch.tensor([episode]))
-    return [stream.item(state, torch.tensor([t]))[0][0].tolist() for t in range(length)]
+    return [stream.item(state, torch.tensor([t])).sides[0].tolist() for t in range(length)]
 
 
 @pytest.mark.parametrize("name", ["rs", "cut1", "cut2"])
@@ -24,7 +36,7 @@ def test_an_episode_is_the_same_in_every_batch(name: str) -> None:
     stream = make_stream(name, BIN)
     together = stream.start(7, torch.arange(50))
     for t in range(8):
-        items = stream.item(together, torch.full((50,), t))[0]
+        items = stream.item(together, torch.full((50,), t)).sides
         for k in (0, 13, 49):
             assert items[k].tolist() == sequence(stream, 7, k, t + 1)[t]
     assert sequence(stream, 7, 3, 8) != sequence(stream, 8, 3, 8)
@@ -41,20 +53,26 @@ def test_splitmix_matches_its_published_outputs() -> None:
 def test_rs_draws_every_type_equally_often() -> None:
     stream = Uniform(2, 5)
     state = stream.start(0, torch.arange(2000))
-    items = torch.cat([stream.item(state, torch.full((2000,), t))[0] for t in range(32)])
+    items = torch.cat([stream.item(state, torch.full((2000,), t)).sides for t in range(32)])
     kind = ((items.long() - 2) * torch.tensor([16, 4, 1])).sum(1)
     counts = torch.bincount(kind, minlength=64)
     assert len(counts) == 64
     assert stats.chisquare(counts.numpy()).pvalue > 1e-4
 
 
-def test_the_compiled_draw_equals_the_tensor_one() -> None:
-    keys, t = episode_keys(-5, torch.arange(4000)), torch.arange(4000) % 37
-    sides, weights = np.empty((4000, 3), np.int16), np.empty(4000)
-    _uniform_items(keys.numpy(), t.numpy(), 1, 5, sides, weights)
-    kind = below(mix(keys, t), 125)
-    assert (sides == torch.stack((kind // 25, kind // 5 % 5, kind % 5), 1).numpy() + 1).all()
-    assert (weights == sides.astype(float).prod(1)).all()
+@pytest.mark.parametrize("backend", Backend)
+def test_rs_draws_the_types_of_its_definition_in_every_backend(backend: Backend) -> None:
+    stream = Uniform(1, 5).to("cpu", backend)
+    assert stream.backend is backend
+    state, t = stream.start(-5, torch.arange(4000)), torch.arange(4000) % 37
+    items = stream.item(state, t)
+    kind = below(mix(episode_keys(-5, torch.arange(4000)), t), 125)
+    sides = torch.stack((kind // 25, kind // 5 % 5, kind % 5), 1) + 1
+    assert items.sides.dtype == torch.int16
+    assert torch.equal(items.sides.long(), sides)
+    assert torch.equal(items.weights, sides.double().prod(1))
+    assert items.ids is t
+    assert items.orientations is None
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -73,7 +91,7 @@ def test_cuts_replayed_through_the_masks_fill_the_bin(
     game = Packing(n, size, f"cut{order}", sides=sides, seed=3, auto_reset=False)
     for t in range(boxes.shape[1]):
         x, y, _, w, d, h = boxes[:, t].long().T
-        assert torch.equal(game.items.long(), torch.stack((w, d, h), 1))
+        assert torch.equal(game.items.sides.long(), torch.stack((w, d, h), 1))
         rest = game.bins.heightmap.long()
         here = game.alive
         cell = x * size[1] + y
@@ -135,7 +153,7 @@ def test_an_impossible_item_is_refused_with_its_row(
 
 
 def test_an_item_that_fits_lying_down_is_taken() -> None:
-    assert check_items([[2, 2, 9]], (10, 4, 4)).items.tolist() == [[[2, 2, 9]]]
+    assert check_items([[2, 2, 9]], (10, 4, 4)).items.sides.tolist() == [[[2, 2, 9]]]
 
 
 def test_files_give_sequences_weights_and_bin(tmp_path: Path) -> None:
@@ -149,25 +167,25 @@ def test_files_give_sequences_weights_and_bin(tmp_path: Path) -> None:
     assert size == (9, 8, 7)
     assert sequences.episodes == 2
     state = sequences.start(0, torch.tensor([0, 1, 2]))
-    sides, weights = sequences.item(state, torch.tensor([1, 1, 0]))
-    assert sides.tolist() == [[5, 5, 5], [0, 0, 0], [2, 3, 4]]
-    assert weights.tolist() == [125, 0, 24]
+    items = sequences.item(state, torch.tensor([1, 1, 0]))
+    assert items.sides.tolist() == [[5, 5, 5], [0, 0, 0], [2, 3, 4]]
+    assert items.weights.tolist() == [125, 0, 24]
 
     (tmp_path / "b.json").write_text('{"bin": [9, 9, 9], "items": [[[2,2,2]], [[3,3,3],[4,4,4]]]}')
     sequences, size = load(tmp_path / "b.json")
     assert size == (9, 9, 9)
-    assert sequences.items.tolist() == [[[2, 2, 2], [0, 0, 0]], [[3, 3, 3], [4, 4, 4]]]
+    assert sequences.items.sides.tolist() == [[[2, 2, 2], [0, 0, 0]], [[3, 3, 3], [4, 4, 4]]]
 
     (tmp_path / "c.csv").write_text("w, d, h, weight\n2,3,4,1.5\n5,5,5,0.25\n")
     sequences, _ = load(tmp_path / "c.csv", BIN)
-    assert sequences.items.tolist() == [[[2, 3, 4], [5, 5, 5]]]
-    assert sequences.weights.tolist() == [[1.5, 0.25]]
+    assert sequences.items.sides.tolist() == [[[2, 3, 4], [5, 5, 5]]]
+    assert sequences.items.weights.tolist() == [[1.5, 0.25]]
 
 
 @pytest.mark.parametrize(
     ("name", "text", "why"),
     [
-        ("a.csv", "w,d\n1,2\n", "no column h"),
+        ("a.csv", "w,d\n1,2\n", "no column 'h'"),
         ("b.csv", "w,d,h\n1,two,3\n", "row 0"),
         ("c.csv", "w,d,h,weight\n2,2,2,-1\n", "row 0 .*weight"),
         ("d.csv", "w,d,h\n", "no items"),
@@ -219,7 +237,8 @@ def test_items_one_by_one_are_as_probable_as_in_their_sequences() -> None:
     rows = [[[2, 2, 2], [3, 3, 3]], [[2, 2, 2], [4, 5, 3]]]
     drawn = independent(make_stream(rows, BIN))
     state = drawn.start(3, torch.arange(4000))
-    sides, weights = drawn.item(state, torch.zeros(4000, dtype=torch.int64))
+    items = drawn.item(state, torch.zeros(4000, dtype=torch.int64))
+    sides, weights = items.sides, items.weights
     assert torch.equal(weights, sides.double().prod(1))
     share = (sides == 2).all(1).double().mean().item()
     assert share == pytest.approx(0.5, abs=0.04)
@@ -229,6 +248,377 @@ def test_items_one_by_one_are_as_probable_as_in_their_sequences() -> None:
     uniform = make_stream("rs", BIN)
     assert independent(uniform) is uniform
     pieces = independent(make_stream("cut1", BIN))
-    found, _ = pieces.item(pieces.start(0, torch.arange(500)), torch.full((500,), 7))
-    assert found.min() == 2
-    assert found.max() == 5
+    t = torch.full((500,), 7)
+    items = pieces.item(pieces.start(0, torch.arange(500)), t)
+    assert items.sides.min() == 2
+    assert items.sides.max() == 5
+    assert items.ids is t
+    assert independent(pieces) is pieces
+
+
+# --- attributes of goods --------------------------------------------------------------------------
+
+ROWS = [[2, 3, 4], [5, 5, 5], [4, 2, 2]]
+GOODS = {
+    "items": ROWS,
+    "weights": [1.5, 0.25, 3],
+    "upright": [True, False, False],
+    "orientations": [[0, 1], [0, 1, 2, 3, 4, 5], [2, 4]],
+    "ids": ["red", "blue", "red"],
+    "quantity": [1, 2, 1],
+}
+CSV = """w,d,h,weight,upright,orientations,id,quantity
+2,3,4,1.5,yes ,0 1, red ,1
+5,5,5,0.25,0,0 1 2 3 4 5,blue,2
+4,2,2,3,False,2 4,red,1
+"""
+
+
+def goods_stream(kind: str, goods: dict, folder: Path) -> Sequences:
+    """Goods as the stream that they give by way of a file, arrays, a mapping or a record."""
+    path = folder / f"goods.{kind}"
+    if kind == "csv":
+        columns = {"items": "w,d,h"} | {a.key: a.column for a in ATTRIBUTES}
+        lines = [",".join(columns[key] for key in goods)]
+        for values in zip(*goods.values(), strict=True):
+            cells = [values[0][0], values[0][1], values[0][2], *values[1:]]
+            lines.append(
+                ",".join(" ".join(map(str, c)) if isinstance(c, list) else str(c) for c in cells)
+            )
+        path.write_text("\n".join(lines))
+        return load(path, BIN)[0]
+    if kind == "json":
+        path.write_text(json.dumps(goods))
+        return load(path, BIN)[0]
+    arrays = {key: np.array(values) for key, values in goods.items() if key != "orientations"}
+    if "orientations" in goods:
+        arrays["orientations"] = np.array([np.isin(range(6), o) for o in goods["orientations"]])
+    if kind == "npz":
+        np.savez(path, **arrays)
+        return load(path, BIN)[0]
+    if kind == "array":
+        return check_items(arrays.pop("items"), BIN, **arrays)
+    if kind == "mapping":
+        return make_stream(goods, BIN)
+    whole = check_items(ROWS, BIN, **{k: v for k, v in goods.items() if k != "items"}).items
+    return make_stream(whole[0] if kind == "record" else whole, BIN)
+
+
+FILES = ["csv", "json", "npz", "array", "mapping"]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_goods_have_the_same_attributes_however_they_are_given(kind: str, tmp_path: Path) -> None:
+    stream = goods_stream(kind, GOODS, tmp_path)
+    assert stream.items.sides[0].tolist() == [[2, 3, 4], [5, 5, 5], [5, 5, 5], [4, 2, 2]]
+    assert stream.items.weights[0].tolist() == [1.5, 0.25, 0.25, 3]
+    allowed = [[o for o in range(6) if row[o]] for row in stream.items.orientations[0].tolist()]
+    assert allowed == [[0, 1], [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5], [2, 4]]
+    names = [stream.id_names[number] for number in stream.items.ids[0]]
+    assert names == ["red", "blue", "blue", "red"]
+    assert stream.orientation_sets == {(0, 1): 0.25, (0, 1, 2, 3, 4, 5): 0.5, (2, 4): 0.25}
+    items = stream.item(torch.tensor([0, 0]), torch.tensor([2, 4]))
+    assert items.ids[0] == stream.items.ids[0, 1]
+    assert items.orientations.all(1).tolist() == [True, False]
+    assert items.sides.tolist() == [[5, 5, 5], [0, 0, 0]]
+
+
+def test_a_csv_writes_attributes_in_words(tmp_path: Path) -> None:
+    (tmp_path / "goods.csv").write_text(CSV)
+    stream, _ = load(tmp_path / "goods.csv", BIN)
+    assert fingerprint(stream) == fingerprint(make_stream(GOODS, BIN))
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_upright_alone_means_orientations_0_and_1(kind: str, tmp_path: Path) -> None:
+    stream = goods_stream(kind, {"items": ROWS, "upright": [1, 0, 1]}, tmp_path)
+    upright = [True, True, False, False, False, False]
+    assert stream.items.orientations[0].tolist() == [upright, [True] * 6, upright]
+    stream = goods_stream(kind, {"items": ROWS, "upright": [0, 0, 0]}, tmp_path)
+    assert stream.items.orientations is None
+
+
+@pytest.mark.parametrize("shape", ["record", "records"])
+def test_a_record_of_items_is_a_stream(shape: str, tmp_path: Path) -> None:
+    goods = {key: values for key, values in GOODS.items() if key != "ids"} | {"ids": [7, 8, 7]}
+    stream, same = goods_stream(shape, goods, tmp_path), make_stream(goods, BIN)
+    assert stream.id_names is None
+    assert stream.items.ids[0].tolist() == [7, 8, 8, 7]
+    assert fingerprint(stream) == fingerprint(same)
+
+
+@pytest.mark.parametrize(
+    ("ids", "numbers", "names"),
+    [
+        (["7", "12"], [7, 12], None),
+        ([7, 12], [7, 12], None),
+        (["007", "12"], [0, 1], ("007", "12")),
+        (["b", "a"], [1, 0], ("a", "b")),
+        ([str(10**30), "1"], [1, 0], ("1", str(10**30))),
+    ],
+)
+def test_ids_are_numbers_or_texts(ids: list, numbers: list[int], names: tuple | None) -> None:
+    stream = check_items([[1, 1, 1], [2, 2, 2]], BIN, ids=ids)
+    assert stream.items.ids.tolist() == [numbers]
+    assert stream.id_names == names
+    assert stream.item(torch.tensor([0]), torch.tensor([1])).ids.tolist() == [numbers[1]]
+
+
+def test_sequences_of_unequal_length_keep_their_attributes(tmp_path: Path) -> None:
+    goods = {
+        "items": [[[2, 2, 2]], [[3, 3, 3], [4, 4, 4]]],
+        "weights": [[1], [2, 3]],
+        "orientations": [[[0]], [[1], [0, 1]]],
+        "quantity": [[3], [1, 1]],
+        "ids": [[5], [6, 7]],
+    }
+    (tmp_path / "a.json").write_text(json.dumps(goods))
+    (tmp_path / "a.csv").write_text(
+        "sequence,w,d,h,weight,orientations,quantity,id\n"
+        "z,2,2,2,1,0,3,5\nb,3,3,3,2,1,1,6\nb,4,4,4,3,0 1,1,7\n"
+    )
+    files = [load(tmp_path / name, BIN)[0] for name in ("a.json", "a.csv")]
+    for stream in (make_stream(goods, BIN), *files):
+        assert stream.items.sides[..., 0].tolist() == [[2, 2, 2], [3, 4, 0]]
+        assert stream.items.weights.tolist() == [[1, 1, 1], [2, 3, 0]]
+        assert stream.items.ids.tolist() == [[5, 5, 5], [6, 7, 0]]
+        assert stream.items.orientations.sum(2).tolist() == [[1, 1, 1], [1, 2, 0]]
+        assert stream.orientation_sets == {(0,): 0.6, (1,): 0.2, (0, 1): 0.2}
+        assert fingerprint(make_stream(stream.items, BIN)) == fingerprint(stream)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("weights", 0, "weight .*; needs a positive number"),
+        ("weights", "heavy", "weight .*; needs a positive number"),
+        ("upright", "maybe", "upright .*; needs true or false"),
+        ("upright", 2, "upright .*; needs true or false"),
+        ("orientations", [0, 6], "orientations .*; needs one or more of the numbers 0 … 5"),
+        ("orientations", [-1], "orientations .*; needs"),
+        ("quantity", 0, "quantity .*; needs a whole number ≥ 1"),
+        ("quantity", 1.5, "quantity .*; needs a whole number ≥ 1"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["json", "mapping", "csv"])
+def test_an_impossible_attribute_is_refused_with_its_row(
+    key: str, value: object, why: str, kind: str, tmp_path: Path
+) -> None:
+    values = [*GOODS[key][:2], value]
+    with pytest.raises(ValueError, match=rf"row 2 is \[4.*: {why}"):
+        goods_stream(kind, {"items": ROWS, key: values}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("orientations", [], r"orientations \[\]; needs"),
+        ("orientations", [True], r"orientations \[True\]; needs"),
+        ("orientations", 0, "orientations 0; needs"),
+        ("ids", "", "id ''; needs a text or a whole number"),
+        ("ids", 1.5, "id 1.5; needs a text or a whole number"),
+        ("ids", True, "id True; needs a text or a whole number"),
+        ("weights", None, "weight None; needs"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["json", "mapping"])
+def test_a_value_of_a_wrong_type_is_refused_with_its_row(
+    key: str, value: object, why: str, kind: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=rf"row 2 is \[4.*: {why}"):
+        goods_stream(kind, {"items": ROWS, key: [*GOODS[key][:2], value]}, tmp_path)
+
+
+def test_an_empty_cell_is_refused_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("w,d,h,id\n\n2,2,2,a\n2,2,2,\n")
+    with pytest.raises(ValueError, match=r"row 1 \(line 4\) .*a value for each of w, d, h, id"):
+        load(tmp_path / "a.csv", BIN)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "why"),
+    [
+        ({"upright": [False, True]}, r"row 1 .*in none of its orientations \[0, 1\]"),
+        ({"orientations": [[0], [1, 0]]}, r"row 1 .*in none of its orientations \[0, 1\]"),
+        ({"orientations": [[0], [0, 2]], "upright": [1, 1]}, "row 1 .*may only be 0 and 1"),
+        ({"weights": [1]}, "'weights' needs one value an item"),
+        ({"ids": "ab"}, "'ids' needs one value an item"),
+        ({"lengths": [3]}, "lengths need 1 whole numbers in 1 … 2"),
+    ],
+)
+def test_attributes_that_exclude_each_other_are_refused(attributes: dict, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        check_items([[2, 2, 2], [2, 2, 5]], (6, 6, 4), **attributes)
+
+
+def test_upright_may_stand_beside_orientations_within_it() -> None:
+    goods = {"orientations": [[0], [2, 3], [1]], "upright": [True, False, False]}
+    stream = check_items(ROWS, BIN, **goods)
+    assert stream.items.orientations[0].int().argmax(1).tolist() == [0, 2, 1]
+    assert stream.items.orientations.sum() == 4
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "hint"),
+    [
+        (
+            "w,d,h,Weight",
+            "unknown column 'Weight'; did you mean 'weight'? Columns: w, d, h, weight",
+        ),
+        ("w,d,h,this_side_up", "'this_side_up'; did you mean 'upright'?"),
+        ("w,d,h,This side up", "'This side up'; did you mean 'upright'?"),
+        ("w,d,h,mass", "'mass'; did you mean 'weight'?"),
+        ("w,d,h,SKU", "'SKU'; did you mean 'id'?"),
+        ("w,d,h,order_id", "'order_id'; did you mean 'sequence'?"),
+        ("w,d,h,qty", "'qty'; did you mean 'quantity'?"),
+        ("w,d,h,orientation", "'orientation'; did you mean 'orientations'?"),
+        (
+            "length,width,height,id",
+            "no column 'w', 'd', 'h'; unknown column 'length'; did you mean",
+        ),
+        ("w,width,h,id", "'width'; did you mean 'd'?"),
+        ("width,d,h,id", "'width'; did you mean 'w'?"),
+        ("w,d,h,colour", "unknown column 'colour'. Columns: w, d, h"),
+    ],
+)
+def test_an_unknown_column_is_refused_with_the_nearest(
+    header: str, hint: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n2,2,2,1\n")
+    with pytest.raises(ValueError, match=re.escape(hint)) as error:
+        load(path, BIN)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("weight", "did you mean 'weights'?"),
+        ("name", "did you mean 'ids'?"),
+        ("mass", "did you mean 'weights'?"),
+        ("colour", "unknown [a-z]+ 'colour'. [A-Z]"),
+    ],
+)
+@pytest.mark.parametrize("kind", FILES[1:])
+def test_an_unknown_key_is_refused_with_the_nearest(
+    key: str, hint: str, kind: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=hint.replace("?", r"\?")):
+        goods_stream(kind, {"items": ROWS, key: [1, 1, 1]}, tmp_path)
+
+
+def test_a_mapping_is_for_its_own_bin() -> None:
+    assert make_stream({"items": ROWS, "bin": BIN}, BIN).longest == 3
+    with pytest.raises(ValueError, match=r"unknown key 'Bin'; did you mean 'bin'\?"):
+        make_stream({"items": ROWS, "Bin": BIN}, BIN)
+    with pytest.raises(ValueError, match="items: is for the bin"):
+        make_stream({"items": ROWS, "bin": [9, 9, 9]}, BIN)
+    with pytest.raises(
+        ValueError, match="items: no key 'items'; unknown key 'boxes'; did you mean"
+    ):
+        make_stream({"boxes": ROWS}, BIN)
+
+
+def test_an_object_that_lacks_a_member_of_a_stream_is_refused() -> None:
+    class Half:
+        smallest, sides, episodes, longest, id_names, orientation_sets = 8, (2, 5), 1, 1, None, {}
+
+        def start(self, seed: int, episodes: torch.Tensor) -> torch.Tensor:
+            return episodes
+
+        def to(self, device: str) -> "Half":
+            return self
+
+    with pytest.raises(ValueError, match=r"items Half: .* needs restart, item$"):
+        make_stream(Half(), BIN)
+    whole = make_stream("cut1", BIN)
+    assert make_stream(whole, BIN) is whole
+
+
+# --- states and fingerprints ----------------------------------------------------------------------
+
+
+def stream_of(name: str, backend: Backend) -> object:
+    """A stream by its name, with the code of a backend."""
+    goods = {"items": [[[k, 2, 2], [2, k, 3]] for k in range(1, 6)]}
+    table = make_stream(goods, BIN)
+    streams = {"sequences": table, "drawn": independent(table)}
+    return (streams.get(name) or make_stream(name, BIN)).to("cpu", backend)
+
+
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize("name", ["rs", "cut1", "cut2", "sequences", "drawn"])
+def test_a_restart_begins_what_ended_and_leaves_the_rest(name: str, backend: Backend) -> None:
+    stream = stream_of(name, backend)
+    before = stream.start(3, torch.arange(6))
+    copy = before.clone()
+    episodes = torch.arange(6) + 9
+    ended = torch.tensor([True, False, False, True, True, False])
+    state = stream.restart(before, 3, episodes, ended)
+    begun = stream.start(3, episodes)
+    assert torch.equal(before, copy), "the state given is not changed"
+    assert torch.equal(state[ended], begun[ended])
+    assert torch.equal(state[~ended], before[~ended])
+    assert not torch.equal(begun[ended], before[ended])
+    assert not torch.equal(begun[~ended], before[~ended])
+    assert torch.equal(
+        stream.restart(before, 3, episodes, torch.zeros(6, dtype=torch.bool)), before
+    )
+
+
+@pytest.mark.parametrize("backend", Backend)
+def test_the_fingerprint_of_rs_is_that_of_saved_games(backend: Backend) -> None:
+    assert fingerprint(make_stream("rs", BIN).to("cpu", backend)) == 54910279278873042
+
+
+def test_fingerprints_of_streams_without_attributes_stay() -> None:
+    assert fingerprint(make_stream("cut1", BIN)) == 53488612129790224
+    rows = make_stream([[2, 3, 4], [5, 5, 5]], BIN)
+    assert fingerprint(rows) == 25778313913411233
+    assert fingerprint(independent(rows)) == 71845663407437813
+
+
+def test_fingerprints_differ_by_every_attribute() -> None:
+    others = [{"weights": [1, 2, 3]}, {"upright": [1, 0, 0]}, {"upright": [0, 1, 0]},
+              {"orientations": [[0], [1], [2]]}, {"ids": [1, 2, 3]}, {"ids": ["a", "b", "c"]},
+              {"ids": ["a", "b", "d"]}, {"quantity": [1, 1, 2]}]  # fmt: skip
+    streams = [check_items(ROWS, BIN, **attributes) for attributes in ({}, *others)]
+    streams += [independent(stream) for stream in streams]
+    assert len({fingerprint(stream) for stream in streams}) == 2 * (1 + len(others))
+
+
+def test_drawn_items_keep_their_attributes() -> None:
+    drawn = independent(make_stream(GOODS, BIN))
+    items = drawn.item(drawn.start(0, torch.arange(900)), torch.arange(900))
+    rows = {
+        (tuple(s), w, tuple(o), drawn.id_names[i])
+        for s, w, o, i in zip(
+            items.sides.tolist(), items.weights.tolist(), items.orientations.tolist(),
+            items.ids.tolist(), strict=True,
+        )
+    }  # fmt: skip
+    whole = tuple([True] * 6)
+    upright = (True, True, False, False, False, False)
+    lying = (False, False, True, False, True, False)
+    assert rows == {
+        ((2, 3, 4), 1.5, upright, "red"),
+        ((5, 5, 5), 0.25, whole, "blue"),
+        ((4, 2, 2), 3.0, lying, "red"),
+    }
+    assert drawn.orientation_sets == {(0, 1): 0.25, (0, 1, 2, 3, 4, 5): 0.5, (2, 4): 0.25}
+
+
+def test_generated_items_may_take_every_orientation() -> None:
+    for name in ("rs", "cut1", "cut2"):
+        stream = make_stream(name, BIN)
+        t = torch.zeros(3, dtype=torch.int64)
+        items = stream.item(stream.start(0, torch.arange(3)), t)
+        assert isinstance(items, Items)
+        assert items.ids is t
+        assert items.orientations is None
+        assert stream.id_names is None
+        assert stream.orientation_sets == {(0, 1, 2, 3, 4, 5): 1.0}

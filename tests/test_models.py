@@ -9,11 +9,12 @@ import torch
 import yaml
 
 from marl_pack import config
-from marl_pack.agents import search
+from marl_pack.agents import learned
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.learning import checkpoint
-from marl_pack.agents.learning.symmetry import mean_probabilities
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.actor_critic import Actor
+from marl_pack.agents.networks.symmetry import mean_probabilities
 from marl_pack.evaluate import main
 from marl_pack.game.packing import Packing
 from marl_pack.play import main as play
@@ -30,40 +31,41 @@ def test_a_model_plays_the_game_it_was_trained_on(
     assert main([*command, "--json", str(table)]) == 0
     figures = yaml.safe_load(table.read_text(encoding="utf-8"))
     rows = figures.get("policies", figures)
-    learned, heuristic = rows[str(path)], rows["dblf"]
-    assert learned["strict_equilibrium"] == 1
-    assert learned["utilization"] > heuristic["utilization"] + 0.05
+    model, heuristic = rows[str(path)], rows["dblf"]
+    assert model["strict_equilibrium"] == 1
+    assert model["utilization"] > heuristic["utilization"] + 0.05
     assert f"{path}: trained on" in capsys.readouterr().out
 
 
-def test_asked_in_all_symmetries_a_model_plays_the_mirrored_bin_alike() -> None:
+def test_in_all_symmetries_a_model_plays_the_same_in_the_mirrored_bin() -> None:
     game = Packing(64, seed=3)
     for _ in range(4):
         game.place(*make_policy("random", 2)(game))
     mirrored = game.branch(torch.arange(game.n))
     for maps in ("heightmap", "empty_map"):
         getattr(mirrored.bins, maps).copy_(getattr(game.bins, maps).flip(1))
-    mirrored.mask = mirrored.masks(mirrored.bins, mirrored.items, mirrored.weights)
+    mirrored.set_state(mirrored.state)
 
-    def alike(symmetric: bool) -> float:
-        policy = checkpoint.find_policy(str(MODELS[-1]), symmetric=symmetric)
-        (way, cell), (other_way, other_cell) = policy(game), policy(mirrored)
-        x = 10 - game.orient(way).sides[:, 0].long() - cell // 10
-        same = (way == other_way) & (x * 10 + cell % 10 == other_cell)
+    def agreement(symmetric: bool) -> float:
+        policy = Loader(symmetric=symmetric).policy(str(MODELS[-1]))
+        (orientation, cell), (other_orientation, other_cell) = policy(game), policy(mirrored)
+        x, y = game.floor.corner(cell)
+        x = 10 - game.orient(orientation).sides[:, 0].long() - x
+        same = (orientation == other_orientation) & (game.floor.cell(x, y) == other_cell)
         return float(same.float().mean())
 
-    assert alike(symmetric=False) < 0.9
-    assert alike(symmetric=True) > 0.95  # but for ties
+    assert agreement(symmetric=False) < 0.9
+    assert agreement(symmetric=True) > 0.95  # but for ties
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
 def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> None:
-    found = checkpoint.read(path)
+    checkpoint = checkpoints.read(path)
     settings = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
-    assert settings == found["config"]
+    assert settings == checkpoint["config"]
     config.from_dict(settings)  # this version reads them
     curve = np.genfromtxt(path.with_suffix(".csv"), delimiter=",", names=True)
-    assert curve["items"][-1] >= found["items"]
+    assert curve["items"][-1] >= checkpoint["items"]
     assert f"## {path.stem}\n" in (path.parent / "README.md").read_text(encoding="utf-8")
 
 
@@ -86,17 +88,17 @@ def test_only_learned_agents_are_asked_in_all_symmetries(
 
 
 @pytest.mark.parametrize("plan", [[], ["--plan", "rollouts=1,top=2,depth=1"]])
-def test_the_option_reaches_the_agents(
+def test_the_option_symmetric_reaches_the_agents(
     plan: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = set()
+    agents = set()
 
     def spied(actor: Actor, observation: Mapping[str, torch.Tensor], agent: str) -> torch.Tensor:
-        asked.add(agent)
+        agents.add(agent)
         return mean_probabilities(actor, observation, agent)
 
-    monkeypatch.setattr(search if plan else checkpoint, "mean_probabilities", spied)
+    monkeypatch.setattr(learned, "mean_probabilities", spied)
     command = ["--policy", str(MODELS[-1]), "--symmetric", "--episodes", "2", *plan]
     assert main(command) == 0
-    assert asked == {"orientation", "placement"}
+    assert agents == {"orientation", "placement"}
     assert "learned agents asked in all" in " ".join(capsys.readouterr().out.split())

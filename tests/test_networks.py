@@ -1,121 +1,191 @@
-"""The agents' networks: what they see, any bin size, shared trunks."""
+"""The agents' networks: their inputs, any bin size, shared trunks, and the kinds of agents."""
 
 import pytest
 import torch
+from torch import Tensor
 
-from marl_pack.agents import joint, orientation, placement
 from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.networks.actor_critic import AGENTS, Actor, Critic, make_actor, make_critic
-from marl_pack.agents.networks.trunk import PLANES, Network, Trunk, input_planes, widen
+from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
+from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice, observe
+from marl_pack.agents.networks.planes import PLANES, channel_names, input_channels
+from marl_pack.agents.networks.symmetry import transform
+from marl_pack.agents.networks.trunk import Network, Trunk, widen
 from marl_pack.game.packing import Packing
 
+ALL_PLANES = tuple(PLANES)
 SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
+PAPER = {"heightmap", "item", "height", "mask"}
 
 
-def observed(agent: str, game: Packing, planes: tuple[str, ...]) -> dict[str, torch.Tensor]:
-    critic = AfterstateCritic()
-    if agent == "placement":
-        chosen = game.orientation_mask.int().argmax(1)
-        return placement.observe(game, planes, chosen, afterstates=critic)
-    return (joint if agent == "joint" else orientation).observe(game, planes, critic)
+def first_orientation(game: Packing, agent: str) -> Choice:
+    """Return what is chosen before the agent's turn: the first legal orientation, or nothing."""
+    return (game.orientation_mask.int().argmax(1),) if agent == "placement" else ()
 
 
-@pytest.mark.parametrize("agent", AGENTS)
-@pytest.mark.parametrize("planes", [(), PLANES])
+def observed(
+    agent: str, game: Packing, planes: tuple[str, ...], *orientation: Tensor
+) -> dict[str, Tensor]:
+    """Return what an agent observes with a lookahead of its own."""
+    before = orientation or first_orientation(game, agent)
+    return observe(agent, game, planes, Lookahead(AfterstateCritic()), *before)
+
+
+@pytest.mark.parametrize("agent", AGENT_KINDS)
+@pytest.mark.parametrize("planes", [(), ALL_PLANES])
 def test_one_network_runs_on_any_bin_size(agent: str, planes: tuple[str, ...]) -> None:
     actor = make_actor(agent, {**SMALL, "planes": list(planes), "context": True}, "cpu")
     for size in ((5, 5, 5), (9, 6, 7), (24, 30, 20)):
-        game = Packing(3, size, sides=(2, 4))
-        seen = observed(agent, game, planes)
-        actions = actor(seen, stochastic_output=True)
+        observation = observed(agent, Packing(3, size, sides=(2, 4)), planes)
+        actions = actor(observation, stochastic_output=True)
         assert actions.shape == (3, 1)
-        assert seen["mask"].gather(1, actions.long()).all()
-        assert actor.distribution.log_probs.shape == seen["mask"].shape
+        assert observation["mask"].gather(1, actions.long()).all()
+        assert actor.distribution.log_probs.shape == observation["mask"].shape
 
 
-def test_the_planes_are_the_papers_four_channels_and_the_extra_ones() -> None:
+def test_the_input_is_the_papers_four_channels_and_those_of_the_planes() -> None:
     game = Packing(1, (4, 6, 8), [[2, 3, 4]] * 2)
     game.place(torch.tensor([0]), torch.tensor([0]))
-    seen = orientation.observe(game, ())
-    seen["item"] = torch.tensor([[2, 3, 4]])
-    planes = input_planes(seen, [])
-    assert planes.shape == (1, 4, 4, 6)
-    assert planes[0, 0, 0, 0] == 4 / 8
-    assert planes[0, 0, 3, 5] == 0
-    assert planes[0, 1:, 2, 2].tolist() == [2 / 4, 3 / 6, 4 / 8]
-    assert (planes[0, 1:] == planes[0, 1:, :1, :1]).all()
-    game = Packing(2, (6, 6, 6), sides=(2, 4))
-    seen = orientation.observe(game, PLANES, AfterstateCritic())
-    assert input_planes(seen, list(PLANES)).shape == (2, 4 + 7 * 6 + 4, 6, 6)
+    observation = observed("orientation", game, ())
+    observation["item"] = torch.tensor([[2, 3, 4]])
+    channels = input_channels(observation, [])
+    assert channels.shape == (1, 4, 4, 6)
+    assert channels[0, 0, 0, 0] == 4 / 8
+    assert channels[0, 0, 3, 5] == 0
+    assert channels[0, 1:, 2, 2].tolist() == [2 / 4, 3 / 6, 4 / 8]
+    assert (channels[0, 1:] == channels[0, 1:, :1, :1]).all()
+    observation = observed("orientation", Packing(2, (6, 6, 6), sides=(2, 4)), ALL_PLANES)
+    assert input_channels(observation, ALL_PLANES).shape == (2, 4 + 7 * 6 + 4, 6, 6)
 
 
-def test_solid_are_the_columns_without_a_gap() -> None:
+@pytest.mark.parametrize("agent", AGENT_KINDS)
+def test_every_kind_of_agent_keeps_the_contract(agent: str) -> None:
+    """K actions are masked and scored, place an item, and mirroring twice changes nothing."""
+    kind = AGENT_KINDS[agent]
+    assert kind.name == agent
+    game = Packing(6, (6, 5, 7), sides=(2, 4), seed=1)
+    game.place(*make_policy("random", 0)(game))
+    before = first_orientation(game, agent)
+    observation = observed(agent, game, ALL_PLANES, *before)
+    cells = 6 * 5 if kind.acts_on_cells else 1
+    actions = (6 if not before else 1) * cells  # K
+    assert kind.orientations == (1 if before else 6)
+    assert observation["mask"].shape == (6, actions)
+    assert observation["mask"].dtype == torch.bool
+    trunk = Trunk(kind.orientations, Network(**SMALL))
+    assert kind.head(Network(**SMALL))(trunk(observation)).shape == (6, actions)
+    action = observation["mask"].int().argmax(1)
+    for symmetry in range(4):
+        bits = torch.full((6,), symmetry)
+        once = transform(observation, action[:, None], agent, bits)
+        assert once[0]["mask"].gather(1, once[1]).all(), "the moved action is legal"
+        twice, moved = transform(*once, agent, bits)
+        assert torch.equal(moved[:, 0], action)
+        assert observation.keys() == twice.keys()
+        assert all(torch.equal(twice[name], observation[name]) for name in observation)
+    choice = kind.extend(before, action, game.floor)
+    if len(choice) == 1:  # the placement agent takes its turn
+        choice = (*choice, game.moves.of(*choice).flatten(1).int().argmax(1))
+    count = game.bins.count.clone()
+    orientation, cell = choice
+    outcome = game.place(orientation, cell)  # raises if it is not legal
+    assert torch.equal(outcome.placed, count + 1)
+
+
+@pytest.mark.parametrize("agent", AGENT_KINDS)
+@pytest.mark.parametrize("name", PLANES)
+def test_every_plane_keeps_the_contract_alone(name: str, agent: str) -> None:
+    """Shapes say what a tensor describes; the channels are as many as the record says."""
+    plane, orientations = PLANES[name], AGENT_KINDS[agent].orientations
+    assert plane.name == name
+    assert plane.meaning
+    game = Packing(5, (6, 5, 7), sides=(2, 4), seed=3)
+    observation = observed(agent, game, (name,))
+    tensors = {key: values for key, values in observation.items() if key not in PAPER}
+    assert tensors
+    columns, numbers, placements = (5, 6, 5), (5, 1), (5, orientations, 6, 5)
+    for key, values in tensors.items():
+        assert tuple(values.shape) in (columns, numbers, placements), key
+    count = plane.channels(orientations)
+    assert channel_names([name], orientations)[4:] == [(name, k) for k in range(count)]
+    channels = input_channels(observation, [name])
+    assert channels.shape == (5, 4 + count, 6, 5)
+    assert channels.dtype == torch.float32
+    assert channels.isfinite().all()
+    action = observation["mask"].int().argmax(1, keepdim=True)
+    mirrored, _ = transform(observation, action, agent, torch.full((5,), 3))
+    assert mirrored.keys() == observation.keys()
+    assert input_channels(mirrored, [name]).shape == channels.shape
+
+
+def test_grounded_are_the_columns_without_a_gap() -> None:
     # A box of 2 x 2 x 2, then a plank across it and beyond.
     game = Packing(1, (4, 2, 8), [[2, 2, 2], [3, 2, 1], [1, 1, 1]])
     game.place(torch.tensor([0]), torch.tensor([0]))
     game.place(torch.tensor([0]), torch.tensor([0]))
-    solid = orientation.observe(game, ("solid",))["solid"]
-    assert solid[0].tolist() == [[True, True], [True, True], [False, False], [True, True]]
-    assert torch.equal(
-        input_planes(orientation.observe(game, ("solid",)), ["solid"])[0, 4], solid[0].float()
-    )
+    observation = observed("orientation", game, ("grounded",))
+    grounded = observation["grounded"]
+    assert grounded[0].tolist() == [[True, True], [True, True], [False, False], [True, True]]
+    assert torch.equal(input_channels(observation, ["grounded"])[0, 4], grounded[0].float())
 
 
-@pytest.mark.parametrize(("dilation", "far"), [(1, 3), (2, 5)])
-def test_three_layers_look_as_far_as_their_dilation_lets_them(dilation: int, far: int) -> None:
+@pytest.mark.parametrize(("dilation", "reach"), [(1, 3), (2, 5)])
+def test_three_layers_reach_as_far_as_their_dilation_allows(dilation: int, reach: int) -> None:
     torch.manual_seed(0)
     trunk = Trunk(1, Network(channels=4, planes=[], dilation=dilation))
-    seen = {
+    observation = {
         "heightmap": torch.zeros(1, 15, 15),
         "item": torch.ones(1, 3),
         "height": torch.full((1, 1), 10),
     }
-    flat = trunk(seen).whole
-    seen["heightmap"][0, 7, 7] = 5
-    changed = (trunk(seen).whole != flat).any(1)[0].nonzero()
-    assert changed.min(0).values.tolist() == [7 - far, 7 - far]
-    assert changed.max(0).values.tolist() == [7 + far, 7 + far]
+    flat = trunk(observation).whole
+    observation["heightmap"][0, 7, 7] = 5
+    changed = (trunk(observation).whole != flat).any(1)[0].nonzero()
+    assert changed.min(0).values.tolist() == [7 - reach, 7 - reach]
+    assert changed.max(0).values.tolist() == [7 + reach, 7 + reach]
 
 
-def test_with_a_shortcut_the_heads_see_the_planes() -> None:
-    game = Packing(3, seed=1)
-    seen = orientation.observe(game, ("mask", "room"))
-    network = Network(channels=4, layers=2, planes=["mask", "room"], shortcut=True)
-    features = Trunk(6, network)(seen).whole
-    planes = input_planes(seen, network.planes)
+def test_with_a_shortcut_the_heads_see_the_input_channels() -> None:
+    observation = observed("orientation", Packing(3, seed=1), ("mask", "feasible_cells"))
+    network = Network(channels=4, layers=2, planes=["mask", "feasible_cells"], shortcut=True)
+    features = Trunk(6, network)(observation).whole
+    channels = input_channels(observation, network.planes)
     assert features.shape == (3, 4 + 4 + 6 + 7, 10, 10)
-    assert torch.equal(features[:, 4:], planes)
+    assert torch.equal(features[:, 4:], channels)
 
 
-def test_room_is_seen_beside_the_most_there_is() -> None:
+def test_feasible_cells_are_seen_beside_the_most_of_any_placement() -> None:
     game = Packing(4, seed=1)
     for _ in range(8):
         game.place(*make_policy("dblf")(game))
-    seen = orientation.observe(game, ("room",))
-    planes = input_planes(seen, ["room"])
-    room, most = planes[:, 4:10], planes[:, 10]
-    assert (room.flatten(1).amax(1) == 1).all()
-    assert (room[~game.mask] == 0).all()
-    best = game.room()[0].flatten(1).argmax(1)
-    assert (room.flatten(1).gather(1, best[:, None]) == 1).all()
-    assert torch.allclose(most[:, 0, 0], game.room()[0].flatten(1).amax(1).log1p() / 4)
-    chosen = best // 100
-    turned = input_planes(placement.observe(game, ("room",), chosen), ["room"])
-    assert torch.equal(turned[:, 4], room[torch.arange(4), chosen])
+    cells = Lookahead().feasible_cells(game)
+    observation = observed("orientation", game, ("feasible_cells",))
+    channels = input_channels(observation, ["feasible_cells"])
+    near, most = channels[:, 4:10], channels[:, 10]
+    assert (near.flatten(1).amax(1) == 1).all()
+    assert (near[~game.mask] == 0).all()
+    best = cells.flatten(1).argmax(1)
+    assert (near.flatten(1).gather(1, best[:, None]) == 1).all()
+    assert torch.allclose(most[:, 0, 0], cells.flatten(1).amax(1).log1p() / 4)
+    orientation, _ = game.floor.split(best)
+    observation = observed("placement", game, ("feasible_cells",), orientation)
+    oriented = input_channels(observation, ["feasible_cells"])
+    assert torch.equal(oriented[:, 4], near[torch.arange(4), orientation])
 
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:
     game = Packing(8, seed=1)
-    seen = orientation.observe(game, PLANES, AfterstateCritic())
-    kept = {name: values.clone() for name, values in seen.items()}
+    observation = observed("orientation", game, ALL_PLANES)
+    copies = {name: values.clone() for name, values in observation.items()}
     for _ in range(30):
         o = game.orientation_mask.int().argmax(1)
         game.place(o, game.orient(o).mask.flatten(1).int().argmax(1))
-    assert all(torch.equal(seen[name], kept[name]) for name in kept)
+    assert all(torch.equal(observation[name], copies[name]) for name in copies)
 
 
-def pair(share: bool) -> tuple[Actor, Critic]:
+def actor_and_critic(share: bool) -> tuple[Actor, Critic]:
+    """Build the placement agent's networks, with one trunk or with two."""
     torch.manual_seed(0)
     arguments = {"agent": "placement", "network": {**SMALL, "share_trunk": share}}
     groups = {"actor": [], "critic": []}
@@ -125,36 +195,35 @@ def pair(share: bool) -> tuple[Actor, Critic]:
 
 
 def test_a_critic_that_shares_the_trunk_sees_the_features_of_the_moment() -> None:
-    actor, critic = pair(share=True)
-    game = Packing(4, (6, 6, 6), sides=(2, 3))
-    first = observed("placement", game, ())
+    actor, critic = actor_and_critic(share=True)
+    first = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
     other = dict(first, item=first["item"] + 1)
     actor(first)
-    kept = critic(first)
-    assert torch.equal(kept, critic(first)), "with and without the actor's features"
+    value = critic(first)
+    assert torch.equal(value, critic(first)), "with and without the actor's features"
     actor(first)
-    assert not torch.equal(critic(other), kept), "another observation is looked at anew"
+    assert not torch.equal(critic(other), value), "another observation gets its own features"
     actor(first)
     critic(first)
     with torch.no_grad():
         for weight in actor.cnns.parameters():
             weight.mul_(0.5)
-    assert not torch.equal(critic(first), kept), "changed weights are seen"
+    assert not torch.equal(critic(first), value), "changed weights are seen"
 
 
 def test_a_shared_trunk_is_the_actors_alone_in_parameters_and_state() -> None:
     for share in (True, False):
-        actor, critic = pair(share)
+        actor, critic = actor_and_critic(share)
         own = {id(p) for p in actor.parameters()}
         assert not own & {id(p) for p in critic.parameters()}
         assert any(name.startswith("cnns.") for name in critic.state_dict()) != share
 
 
-def test_a_critic_teaches_the_shared_trunk() -> None:
-    actor, critic = pair(share=True)
-    seen = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
-    actor(seen, stochastic_output=True)
-    critic(seen).sum().backward()
+def test_a_critic_trains_the_shared_trunk() -> None:
+    actor, critic = actor_and_critic(share=True)
+    observation = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
+    actor(observation, stochastic_output=True)
+    critic(observation).sum().backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in actor.cnns.parameters())
 
 
@@ -165,28 +234,38 @@ def test_an_impossible_network_is_refused(wrong: dict[str, object]) -> None:
         Network(**wrong)
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize(("old", "new"), [
+    ("rest", "resting_height"), ("room", "feasible_cells"), ("fits", "feasible_probability"),
+    ("worth", "afterstate_value"), ("solid", "grounded"),
+])  # fmt: skip
+def test_a_plane_by_its_old_name_is_refused_with_the_new_one(old: str, new: str) -> None:
+    with pytest.raises(ValueError, match=f"network: plane '{old}' is now called '{new}'"):
+        Network(planes=["mask", old])
+    assert Network(planes=["mask", new]).planes == ["mask", new]
+
+
+@pytest.mark.parametrize("agent", AGENT_KINDS)
 @pytest.mark.parametrize("shortcut", [False, True])
 @pytest.mark.parametrize("share", [False, True])
-def test_a_widened_network_computes_what_it_did(agent: str, shortcut: bool, share: bool) -> None:
+def test_a_widened_network_computes_the_same(agent: str, shortcut: bool, share: bool) -> None:
     shape = {**SMALL, "shortcut": shortcut, "context": True, "share_trunk": share}
-    held = shape | {"planes": ["waste", "room"]}
-    wanted = shape | {"planes": ["filled", "room", "mask", "waste"]}
+    narrow = shape | {"planes": ["waste", "feasible_cells"]}
+    wide = shape | {"planes": ["filled", "feasible_cells", "mask", "waste"]}
     game = Packing(4, (6, 5, 7), sides=(2, 4))
     game.place(*make_policy("random", seed=0)(game))
-    seen = observed(agent, game, PLANES)
-    answers = []
+    observation = observed(agent, game, ALL_PLANES)
     networks = []
-    for network in (held, wanted):
+    for network in (narrow, wide):
         actor = make_actor(agent, network, "cpu")
         networks.append((actor, make_critic(agent, network, "cpu", actor)))
-    for narrow, wide in zip(*networks, strict=True):
-        weights = narrow.state_dict()
-        shapes = Network(**held), Network(**wanted)
-        wide.load_state_dict(widen(weights, *shapes, AGENTS[agent].WAYS))
+    shapes = Network(**narrow), Network(**wide)
+    for old, new in zip(*networks, strict=True):
+        weights = widen(old.state_dict(), *shapes, AGENT_KINDS[agent].orientations)
+        new.load_state_dict(weights)
+    outputs = []
     for actor, critic in networks:
-        actor(seen, stochastic_output=True)
-        answers.append((actor.output_distribution_params[0], critic(seen)))
-    assert answers[0][1].std() > 0
-    for narrow_answer, wide_answer in zip(*answers, strict=True):
-        assert torch.allclose(narrow_answer, wide_answer, atol=1e-6)
+        actor(observation, stochastic_output=True)
+        outputs.append((actor.output_distribution_params[0], critic(observation)))
+    assert outputs[0][1].std() > 0
+    for old_output, new_output in zip(*outputs, strict=True):
+        assert torch.allclose(old_output, new_output, atol=1e-6)

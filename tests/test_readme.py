@@ -19,4 +19,4 @@ def test_an_example_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out.strip()
     promised = re.search(r"print\(.*\)  # ([^:\n]*)", code)
     assert printed == promised[1] if promised else printed
-    assert len(EXAMPLES) == 5
+    assert len(EXAMPLES) == 6

@@ -34,7 +34,7 @@ def disjoint(rng, size, tries=60):
 
 
 def stacked(rng, size, n):
-    """Random boxes let down one on another."""
+    """Random boxes lowered one on another."""
     tops = np.zeros(size[:2], dtype=int)
     boxes = []
     while len(boxes) < n:
@@ -72,8 +72,8 @@ def assert_painted_right(boxes, size, rng, n=400):
     strokes[:, 2] = level
     painted = met(rays, strokes) > -np.inf
     last = len(order) - 1 - painted[:, ::-1].argmax(1)
-    seen = np.where(painted.any(1), np.array([i for i, _ in order])[last], -1)
-    np.testing.assert_array_equal(seen, nearest)
+    shown = np.where(painted.any(1), np.array([i for i, _ in order])[last], -1)
+    np.testing.assert_array_equal(shown, nearest)
 
 
 @pytest.mark.parametrize("size", [SIZE, (20, 10, 12), (6, 30, 9)])
@@ -114,8 +114,8 @@ def test_each_pixel_has_the_colour_of_the_face_nearest_to_the_camera(seed):
     from_middle = (rays - np.array(SIZE) / 2) * scale
     column = np.floor(0.49 * 960.5 + from_middle @ right).astype(int)
     row = np.floor(600 - 0.5 * 600.5 - from_middle @ up).astype(int)
-    seen = image[row, column]
-    wrong = (np.abs(seen - expected).max(-1) > 3) & (seen.max(-1) > 90)  # darker ones are edges
+    pixels = image[row, column]
+    wrong = (np.abs(pixels - expected).max(-1) > 3) & (pixels.max(-1) > 90)  # darker ones are edges
     assert wrong.mean() < 0.08  # at most what borders on an edge
 
 

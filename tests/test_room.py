@@ -1,53 +1,47 @@
-"""What placements leave: against the meaning of the words, and tensor code against compiled."""
+"""Afterstates against the meaning of their fields, and bits against masks."""
 
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
 import pytest
 import torch
 from conftest import in_play
+from test_backends import GAMES
 
-from marl_pack.agents.afterstates import bitboards
 from marl_pack.agents.afterstates.afterstates import (
-    WORTH_A_THREAD,
+    PER_THREAD,
     Afterstates,
-    _left_torch,
+    afterstates_by_compiled_loops,
     afterstates_of,
+    count_by_masks,
     probe_lengths,
 )
+from marl_pack.agents.afterstates.bitboards import count_by_bits, fit_in_words
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.stability import reference
 
-GAMES = (
-    {},
-    {"size": (6, 5, 7), "sides": (1, 3)},
-    {"orientations": (0, 3)},
-    {"size": (16, 12, 20), "sides": (3, 12)},
-    {"size": (10, 10, 4), "items": "cut1"},
-    {"com_offset": (0.3, 0.2, 0.0)},
-    {"size": (3, 40, 9), "sides": (1, 3)},
-    {"size": (64, 2, 9), "sides": (1, 2)},
-    {"size": (14, 6, 6), "items": [[2, 2, 2], [13, 2, 2], [3, 4, 5]] * 4},
-)
 
-
-def legal_cells(heights: np.ndarray, hollow: np.ndarray, box: tuple[int, ...], top: int) -> int:
+def legal_cells(heights: np.ndarray, empty_map: np.ndarray, box: tuple[int, ...], top: int) -> int:
     """Cells where ``box`` stands by hull_alpha, one window at a time."""
     w, d, _ = box
 
     def stands(x: int, y: int) -> bool:
         window = np.s_[x : x + w, y : y + d]
-        return reference.hull(heights[window], hollow[window] == 0, (w / 2, d / 2))
+        return reference.hull(heights[window], empty_map[window] == 0, (w / 2, d / 2))
 
     return int(reference.window_mask(stands, heights, box, top).sum())
 
 
 @pytest.mark.parametrize("orientations", [(0, 1, 2, 3, 4, 5), (0, 1), (3,)])
 def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) -> None:
-    game = in_play(3, 4, size=(5, 4, 6), sides=(1, 3), orientations=orientations)
-    room, fits = game.room()
+    game = in_play(3, 4, bin=(5, 4, 6), sides=(1, 3), orientations=orientations)
+    lookahead = Lookahead()
+    room, fits = lookahead.feasible_cells(game), lookahead.feasible_probability(game)
     chances = []
     for b, o in product(range(3), orientations):
         for x, y in game.mask[b, o].nonzero().tolist()[:2]:
@@ -57,10 +51,10 @@ def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) ->
             boxes = list(product((1, 2, 3), repeat=3))
             cells = {box: legal_cells(*maps, box, 6) for box in boxes}
             assert room[b, o, x, y].item() == pytest.approx(np.mean(list(cells.values())))
-            ways = [ORIENTATIONS[a] for a in orientations]
-            found = [any(cells[tuple(box[k] for k in way)] for way in ways) for box in boxes]
-            assert fits[b, o, x, y].item() == pytest.approx(np.mean(found))
-            chances.append(np.mean(found))
+            axes = [ORIENTATIONS[a] for a in orientations]
+            feasible = [any(cells[tuple(box[k] for k in row)] for row in axes) for box in boxes]
+            assert fits[b, o, x, y].item() == pytest.approx(np.mean(feasible))
+            chances.append(np.mean(feasible))
     assert min(chances) < 1  # some placements leave no place for some items
     assert not room[~game.mask].any()
     assert not fits[~game.mask].any()
@@ -69,43 +63,38 @@ def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) ->
 def maps(left: Afterstates, game: Packing) -> list[torch.Tensor]:
     """Everything that is known of each placement, on the bins' maps."""
     known = [left.counts.flatten(1), left.surface, left.volume[:, None], left.waste[:, None],
-             left.filled[:, None], left.room()[:, None],
-             left.chance(game.orientations)[:, None]]  # fmt: skip
+             left.filled[:, None], left.feasible_cells()[:, None],
+             left.feasible_probability({game.spec.orientations: 1.0})[:, None]]  # fmt: skip
     return [torch.where(game.mask[..., None], values[left.index], 0) for values in known]
 
 
-def settings_of_left(game: Packing) -> tuple[object, ...]:
-    sides = game.orient_item(game.items, game.weights).sides
+def arguments_of(game: Packing) -> tuple[object, ...]:
+    sides = game.orient_item(game.items).sides
     return game.bins, sides, game.mask, probe_lengths(*game.stream.sides)
 
 
-@pytest.mark.parametrize("settings", GAMES)
-def test_tensor_code_gives_the_same_numbers(settings: dict[str, object]) -> None:
-    game = in_play(6, 9, **settings)
-    known = settings_of_left(game)
-    for ours, theirs in zip(
-        maps(afterstates_of(*known), game), maps(_left_torch(*known), game), strict=True
-    ):
-        assert torch.allclose(ours.double(), theirs.double(), rtol=0, atol=1e-6)
-        if not ours.is_floating_point():
-            assert torch.equal(ours, theirs)
-
-
 @pytest.mark.parametrize("settings", GAMES[:3] + GAMES[4:])
-def test_sets_of_bits_say_what_maps_say(
-    settings: dict[str, object], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sets_of_bits_count_what_masks_count(settings: dict[str, object]) -> None:
     game = in_play(64, 12, **settings)
-    assert bitboards.hold(*game.size[:2])
-    known = settings_of_left(game)
-    bits = afterstates_of(*known)
-    monkeypatch.setattr(bitboards, "hold", lambda width, depth: False)
-    assert torch.equal(afterstates_of(*known).counts, bits.counts)
+    assert fit_in_words(*game.size[:2])
+    bits, masks = (
+        afterstates_by_compiled_loops(*arguments_of(game), count_cells=code).counts
+        for code in (count_by_bits, count_by_masks)
+    )
+    assert torch.equal(bits, masks)
+
+
+def test_the_probability_is_weighted_by_the_shares_of_the_orientation_sets() -> None:
+    left = Lookahead().afterstates(in_play(8, 6))
+    upright, all_six = (left.feasible_probability({o: 1.0}) for o in ((0, 1), tuple(range(6))))
+    mixed = left.feasible_probability({(0, 1): 0.25, tuple(range(6)): 0.75})
+    assert torch.allclose(mixed, 0.25 * upright + 0.75 * all_six)
+    assert (upright < all_six).any()
 
 
 def test_what_is_said_of_a_placement_is_what_it_does() -> None:
     game = in_play(8, 5)
-    left = game.left()
+    left = Lookahead().afterstates(game)
     policy = make_policy("random", seed=2)
     o, c = policy(game)
     row = left.index[torch.arange(8), o, c // 10, c % 10]
@@ -113,8 +102,8 @@ def test_what_is_said_of_a_placement_is_what_it_does() -> None:
     after.place(o, c)
     assert torch.equal(left.filled[row], after.bins.filled)
     assert torch.equal(left.volume[row], after.bins.filled - game.bins.filled)
-    hollow = [b.empty_map.sum((1, 2), dtype=torch.int64) for b in (game.bins, after.bins)]
-    assert torch.equal(left.waste[row], hollow[1] - hollow[0])
+    empty_map = [b.empty_map.sum((1, 2), dtype=torch.int64) for b in (game.bins, after.bins)]
+    assert torch.equal(left.waste[row], empty_map[1] - empty_map[0])
     heights = after.bins.heightmap
     for level in range(11):
         share = (heights == level).float().mean((1, 2))
@@ -126,11 +115,12 @@ def test_what_is_said_of_a_placement_is_what_it_does() -> None:
 
 
 def test_lengths_longer_than_the_floor_have_no_place() -> None:
-    game = in_play(4, 3, size=(3, 12, 9), sides=(1, 3))
-    sides = game.orient_item(game.items, game.weights).sides
+    game = in_play(4, 3, bin=(3, 12, 9), sides=(1, 3))
+    sides = game.orient_item(game.items).sides
     for lengths in ((4, 5), (2, 13), (20,)):
         known = game.bins, sides, game.mask, lengths
-        ours, theirs = afterstates_of(*known), _left_torch(*known)
+        ours = afterstates_of(*known)
+        theirs = afterstates_of(replace(game.bins, backend=Backend.TENSOR), *known[1:])
         for counts in (ours, theirs):
             assert not counts.counts[:, -1].any()
         assert torch.equal(maps(ours, game)[0], maps(theirs, game)[0])
@@ -138,17 +128,18 @@ def test_lengths_longer_than_the_floor_have_no_place() -> None:
 
 def test_of_no_bins_there_is_nothing_left() -> None:
     game = in_play(4, 3).branch(torch.zeros(0, dtype=torch.int64))
-    assert game.room()[0].shape == (0, 6, 10, 10)
+    assert Lookahead().feasible_cells(game).shape == (0, 6, 10, 10)
 
 
 def test_a_branch_knows_what_is_left_already() -> None:
-    game = in_play(6, 4)
-    left = game.left()
+    game, lookahead = in_play(6, 4), Lookahead()
+    left = lookahead.afterstates(game)
     which = torch.tensor([4, 1, 1])
-    branch = game.branch(which)
-    assert branch.left().counts is left.counts
-    fresh = afterstates_of(*settings_of_left(branch))
-    for known, made in zip(maps(branch.left(), branch), maps(fresh, branch), strict=True):
+    branch = lookahead.branch(game, which)
+    assert lookahead.afterstates(branch).counts is left.counts
+    fresh = afterstates_of(*arguments_of(branch))
+    own = lookahead.afterstates(branch)
+    for known, made in zip(maps(own, branch), maps(fresh, branch), strict=True):
         assert torch.equal(known, made)
 
 
@@ -156,26 +147,28 @@ def test_no_placement_no_room() -> None:
     game = Packing(2, (4, 4, 4), [[3, 3, 3]] * 3, auto_reset=False)
     while game.alive.any():
         game.place(*make_policy("dblf")(game))
-    assert game.left().room().shape == game.left().chance([0]).shape == (0,)
-    room, fits = game.room()
+    assert Lookahead().afterstates(game).feasible_cells().shape == (0,)
+    assert Lookahead().afterstates(game).feasible_probability({(0,): 1.0}).shape == (0,)
+    room, fits = Lookahead().feasible_cells(game), Lookahead().feasible_probability(game)
     assert room.shape == fits.shape == (2, 6, 4, 4)
     assert not room.any()
 
 
-def test_it_is_of_the_moment_and_a_branch_has_its_own() -> None:
-    game = in_play(4, 3)
-    first = game.room()[0]
-    assert game.room()[0] is first
-    copy = game.branch(torch.tensor([2, 0]))
-    assert torch.equal(copy.room()[0], first[[2, 0]])
+def test_a_lookahead_belongs_to_one_turn_of_one_game() -> None:
+    game, lookahead = in_play(4, 3), Lookahead()
+    first = lookahead.feasible_cells(game)
+    assert lookahead.feasible_cells(game) is first
+    copy = lookahead.branch(game, torch.tensor([2, 0]))
+    assert torch.equal(lookahead.feasible_cells(copy), first[[2, 0]])
+    assert torch.equal(lookahead.feasible_cells(game), first)
     game.place(*make_policy("dblf")(game))
-    assert not torch.equal(game.room()[0], first)
-    assert torch.equal(copy.room()[0], first[[2, 0]])
-    kept = game.state_dict()
-    second = game.room()[0]
+    assert not torch.equal(lookahead.feasible_cells(game), first)
+    assert torch.equal(lookahead.feasible_cells(copy), first[[2, 0]])
+    state = game.state_dict()
+    second = lookahead.feasible_cells(game)
     game.place(*make_policy("dblf")(game))
-    game.load_state_dict(kept)
-    assert torch.equal(game.room()[0], second)
+    game.load_state_dict(state)
+    assert torch.equal(lookahead.feasible_cells(game), second)
 
 
 def test_lengths_are_spread_evenly_and_few() -> None:
@@ -190,22 +183,22 @@ def test_the_heuristic_leaves_more_than_others_do() -> None:
     game = in_play(32, 6)
     rows = torch.arange(32)
     left = []
-    for name in ("most_room", "dblf", "random"):
+    for name in ("max_feasible", "dblf", "random"):
         o, c = make_policy(name)(game)
-        left.append(game.room()[0].flatten(2)[rows, o, c])
+        left.append(Lookahead().feasible_cells(game).flatten(2)[rows, o, c])
     assert (left[0] >= left[1]).all()
     assert (left[0] >= left[2]).all()
     assert left[0].mean() > left[1].mean() > left[2].mean()
-    best = game.room()[0].flatten(1).amax(1)
+    best = Lookahead().feasible_cells(game).flatten(1).amax(1)
     assert torch.equal(left[0], best)
 
 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     game = in_play(12, 5)
-    assert int(game.mask.sum()) > 3 * WORTH_A_THREAD  # so several share the work
+    assert int(game.mask.sum()) > 3 * PER_THREAD  # so several share the work
     given = []
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda t=threads: t)
-        given.append(maps(afterstates_of(*settings_of_left(game)), game))
+        given.append(maps(afterstates_of(*arguments_of(game)), game))
     for alone, shared in zip(*given, strict=True):
         assert torch.equal(alone, shared)

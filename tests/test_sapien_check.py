@@ -1,6 +1,7 @@
-"""The judge: stacks whose fate is known, what collides with what, what is refused at the door."""
+"""The judge: stacks whose fate is known, what collides with what, what is refused."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -8,24 +9,25 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import torch
 
 from marl_pack import evaluate
-from marl_pack.evaluate import load_stacks
 from marl_pack.game.packing import Packing
+from marl_pack.physics import controls, film, table1
+from marl_pack.physics.command import main
+from marl_pack.plan import Plan
+from marl_pack.plan_archive import load_plans
 from marl_pack.sapien_check import (
     Physics,
     SimulationError,
     Stack,
     check,
-    controls,
-    film,
     judge,
     judge_all,
-    table1,
 )
-from marl_pack.sapien_check.__main__ import main
+from marl_pack.sapien_check import world as world_module
 from marl_pack.sapien_check.bodies import Bodies
-from marl_pack.sapien_check.judge import GROUND_BIT, World, collision_groups
+from marl_pack.sapien_check.world import GROUND_BIT, World, collision_groups
 from marl_pack.stability import in_equilibrium
 
 BIN = (10, 10, 10)
@@ -40,7 +42,7 @@ def stack(*boxes: tuple[float, ...], **named: object) -> Stack:
 # --- what is refused ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("boxes", "named", "told"), [
+@pytest.mark.parametrize(("boxes", "named", "why"), [
     ([FLAT, (3, 3, 0, 2, 2, 2)], {}, r"box 1 \(3, 3, 0, 2, 2, 2\) overlaps box 0 \(0, 0, 0"),
     ([FLAT, (8, 0, 0, 3, 1, 1)], {}, r"box 1 .*: reaches out of the bin"),
     ([(0, 0, 9, 1, 1, 2)], {}, r"box 0 .*: reaches out of the bin"),
@@ -62,9 +64,9 @@ def stack(*boxes: tuple[float, ...], **named: object) -> Stack:
     ([FLAT], {"density": 1e308, "cell": 100.0}, r"box 0 .*: its mass is not a number > 0"),
 ])  # fmt: skip
 def test_a_stack_that_cannot_be_is_refused_with_the_box_named(
-    boxes: list[tuple[float, ...]], named: dict[str, object], told: str
+    boxes: list[tuple[float, ...]], named: dict[str, object], why: str
 ) -> None:
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=why):
         stack(*boxes, **named)
 
 
@@ -97,46 +99,46 @@ def test_a_simulation_that_breaks_down_is_an_error(monkeypatch: pytest.MonkeyPat
 
 
 def test_cells_become_metres_and_kilograms() -> None:
-    made = stack(FLAT, (0, 0, 2, 2, 4, 1), cell=0.1, com_offset=(0.25, 0, -0.25))
-    assert made.size == pytest.approx([1, 1, 1])
-    assert made.low[1] == pytest.approx([0, 0, 0.2])
-    assert made.sides[1] == pytest.approx([0.2, 0.4, 0.1])
-    assert made.mass == pytest.approx([500 * 0.032, 500 * 0.008])
-    assert made.com[1] == pytest.approx([0.05, 0, -0.025])
+    pile = stack(FLAT, (0, 0, 2, 2, 4, 1), cell=0.1, com_offset=(0.25, 0, -0.25))
+    assert pile.size == pytest.approx([1, 1, 1])
+    assert pile.low[1] == pytest.approx([0, 0, 0.2])
+    assert pile.sides[1] == pytest.approx([0.2, 0.4, 0.1])
+    assert pile.mass == pytest.approx([500 * 0.032, 500 * 0.008])
+    assert pile.com[1] == pytest.approx([0.05, 0, -0.025])
     assert stack(FLAT).size == pytest.approx([0.6, 0.6, 0.6])  # the paper's bin
     assert stack(FLAT, density=None, mass=7.0).mass == pytest.approx([7])
 
 
 def test_faces_that_share_an_edge_only_do_not_touch() -> None:
-    made = stack(FLAT, (4, 0, 0, 2, 4, 2), (0, 0, 2, 4, 4, 1), (4, 0, 2, 2, 2, 2))
-    assert np.argwhere(made.rests_on()).tolist() == [[2, 0], [3, 1]]
+    pile = stack(FLAT, (4, 0, 0, 2, 4, 2), (0, 0, 2, 4, 4, 1), (4, 0, 2, 2, 2, 2))
+    assert np.argwhere(pile.rests_on()).tolist() == [[2, 0], [3, 1]]
 
 
 def random_stack(seed: int, rule: str = "none") -> Stack:
-    """Small boxes set down anywhere: many close to one another."""
+    """Small boxes placed anywhere: many close to one another."""
     game = Packing(1, (12, 12, 12), sides=(1, 4), rule=rule, auto_reset=False, seed=seed)
     draw = np.random.default_rng(seed)
     while bool(game.alive):
-        orientation, cell = divmod(int(draw.choice(np.flatnonzero(game.mask[0].numpy()))), 144)
-        game.place(*(game.items.new_tensor([k]).long() for k in (orientation, cell)))
+        pair = torch.tensor([draw.choice(np.flatnonzero(game.mask[0].numpy()))])
+        game.place(*game.floor.split(pair))
     boxes = game.bins.boxes[0, : int(game.bins.count)].numpy()
     return Stack.of_cells((12, 12, 12), boxes, density=300.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_rests_on_another_collides_with_it_and_no_neighbour_does(seed: int) -> None:
-    made = random_stack(seed)
-    assert len(made) > 20
-    groups = np.array(collision_groups(made, Physics()), np.int64)
+    pile = random_stack(seed)
+    assert len(pile) > 20
+    groups = np.array(collision_groups(pile, Physics()), np.int64)
     first, second = groups[:, 0], groups[:, 1]
     collide = ((first[:, None] & second) | (second[:, None] & first)) > 0
-    on = made.rests_on()
+    on = pile.rests_on()
     touch = on | on.T
     assert collide[touch].all()
-    gap = np.maximum(made.low[:, None], made.low) - np.minimum(made.high[:, None], made.high)
-    near = (gap < 0.01).all(-1) & ~np.eye(len(made), dtype=bool)
+    gap = np.maximum(pile.low[:, None], pile.low) - np.minimum(pile.high[:, None], pile.high)
+    near = (gap < 0.01).all(-1) & ~np.eye(len(pile), dtype=bool)
     assert not (collide & near & ~touch).any()
-    assert (((second >> GROUND_BIT) & 1) == (made.low[:, 2] < 1e-6)).all()
+    assert (((second >> GROUND_BIT) & 1) == (pile.low[:, 2] < 1e-6)).all()
     assert not ((first >> GROUND_BIT) & 1).any()
 
 
@@ -148,23 +150,22 @@ def test_what_rests_on_another_collides_with_it_and_no_neighbour_does(seed: int)
 def test_a_control_is_judged_right_a_fifth_of_a_millimetre_from_tipping(
     name: str, margin: float
 ) -> None:
-    boxes = controls.FAMILIES[name](margin)
-    assert check(boxes.stack()).stands == (margin > 0)
-    assert boxes.stands() == (margin > 0)
+    plan = controls.FAMILIES[name](margin)
+    assert check(Stack.of_plan(plan)).stands == (margin > 0)
+    assert controls.exact_equilibrium(plan) == (margin > 0)
 
 
 @pytest.mark.parametrize("name", controls.STANDING)
 def test_what_stands_with_room_to_spare_stands(name: str) -> None:
-    boxes = controls.STANDING[name]()
-    verdict = check(boxes.stack())
+    verdict = check(Stack.of_plan(controls.STANDING[name]()))
     assert verdict.stands
     assert verdict.passes == 1
     assert verdict.distance.max() < 1e-3
 
 
 def test_a_verdict_says_what_moved_and_how_far() -> None:
-    made = stack(FLAT, (6, 6, 0, 2, 2, 2), (2, 0, 2, 5, 4, 1))  # its middle 0.5 cells over the edge
-    verdict = check(made)
+    pile = stack(FLAT, (6, 6, 0, 2, 2, 2), (2, 0, 2, 5, 4, 1))  # its middle 0.5 cells over the edge
+    verdict = check(pile)
     assert not verdict.stands
     assert verdict.moved == (2,)
     assert verdict.angle[2] > 1
@@ -173,28 +174,28 @@ def test_a_verdict_says_what_moved_and_how_far() -> None:
 
 
 def test_judging_ends_at_the_first_fall() -> None:
-    made = stack(FLAT, (2, 0, 2, 5, 4, 1), (0, 4, 0, 1, 1, 1))
-    assert [verdict.stands for verdict in judge(made)] == [True, False]
-    assert list(judge(made.first(0))) == []
-    assert check(made.first(0)).stands
+    pile = stack(FLAT, (2, 0, 2, 5, 4, 1), (0, 4, 0, 1, 1, 1))
+    assert [verdict.stands for verdict in judge(pile)] == [True, False]
+    assert list(judge(pile.first(0))) == []
+    assert check(pile.first(0)).stands
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_judging_only_what_hangs_together_with_the_last_box_finds_what_judging_all_does(
     seed: int,
 ) -> None:
-    made = random_stack(seed, "none")
-    for count, verdict in enumerate(judge(made), 1):
-        whole = check(made.first(count))
+    pile = random_stack(seed, "none")
+    for count, verdict in enumerate(judge(pile), 1):
+        whole = check(pile.first(count))
         assert verdict.stands == whole.stands
         assert verdict.moved == whole.moved
         assert verdict.distance.shape == verdict.angle.shape == (count,)
 
 
 def test_where_all_boxes_collide_a_neighbour_props_up_what_falls() -> None:
-    made = controls.propped(0.0, 100.0, -5.0).stack()
-    assert not check(made).stands
-    assert check(made, Physics(everything=True)).stands
+    pile = Stack.of_plan(controls.propped(0.0, 100.0, -5.0))
+    assert not check(pile).stands
+    assert check(pile, Physics(everything=True)).stands
 
 
 def test_walls_hold_where_they_collide() -> None:
@@ -213,8 +214,8 @@ def test_walls_hold_where_they_collide() -> None:
 @pytest.mark.parametrize("cell", [1e-4, 0.06, 4.0])
 def test_a_verdict_knows_no_unit_of_mass_or_length(unit: float, cell: float) -> None:
     for far, stands in ((2, False), (1, True)):
-        made = Stack.of_cells(BIN, [FLAT, (far, 0, 2, 5, 4, 1)], cell=cell, mass=unit)
-        assert check(made).stands == stands
+        pile = Stack.of_cells(BIN, [FLAT, (far, 0, 2, 5, 4, 1)], cell=cell, mass=unit)
+        assert check(pile).stands == stands
 
 
 def test_heavy_boxes_on_light_ones_stand() -> None:
@@ -227,11 +228,11 @@ def test_heavy_boxes_on_light_ones_stand() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_the_judge_agrees_with_the_exact_equilibrium_on_random_stacks(seed: int) -> None:
     """The first stack of each bin that statics calls unstable, and the one before it."""
-    made = random_stack(seed, "hull_1" if seed % 2 else "none")
+    pile = random_stack(seed, "hull_1" if seed % 2 else "none")
     rng = np.random.default_rng(seed)
     bodies = replace(
-        made, mass=made.mass * rng.uniform(1, 30, len(made)),
-        com=made.sides * rng.uniform(-0.15, 0.15, made.com.shape),
+        pile, mass=pile.mass * rng.uniform(1, 30, len(pile)),
+        com=pile.sides * rng.uniform(-0.15, 0.15, pile.com.shape),
     )  # fmt: skip
     cell = bodies.size[0] / 12
     boxes = np.rint(np.hstack([bodies.low, bodies.sides]) / cell).astype(np.int64)
@@ -246,14 +247,14 @@ def test_the_judge_agrees_with_the_exact_equilibrium_on_random_stacks(seed: int)
 def test_a_centre_of_mass_decides() -> None:
     leaning = stack(FLAT, (2, 0, 2, 4, 4, 4), com_offset=[(0, 0, 0), (0.1, 0, 0)])
     assert not check(leaning).stands
-    held = stack(FLAT, (2, 0, 2, 4, 4, 4), com_offset=[(0, 0, 0), (-0.1, 0, 0)])
-    assert check(held).stands
+    balanced = stack(FLAT, (2, 0, 2, 4, 4, 4), com_offset=[(0, 0, 0), (-0.1, 0, 0)])
+    assert check(balanced).stands
 
 
 def test_several_processes_judge_alike() -> None:
-    made = [stack(FLAT, (2, 0, 2, 5, 4, 1)), stack(FLAT), stack(FLAT, (0, 0, 2, 4, 4, 1))]
-    alone = list(judge_all(made))
-    both = list(judge_all(made, processes=2))
+    piles = [stack(FLAT, (2, 0, 2, 5, 4, 1)), stack(FLAT), stack(FLAT, (0, 0, 2, 4, 4, 1))]
+    alone = list(judge_all(piles))
+    both = list(judge_all(piles, processes=2))
     assert [j.placements for j in alone] == [j.placements for j in both] == [2, 1, 2]
     assert [j.fall is None for j in alone] == [j.fall is None for j in both] == [False, True, True]
     assert alone[0].fall is not None
@@ -267,22 +268,22 @@ def test_several_processes_judge_alike() -> None:
 def test_bodies_are_drawn_within_their_bounds_and_the_same_again(tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     evaluate.main(["--episodes", "3", "--save-stacks", str(path)])
-    played = load_stacks(path)
-    plain = Bodies().stack(played, 1)
+    plans = load_plans(path)
+    plain = Bodies().stack(plans[1], 1)
     assert plain.mass == pytest.approx(500 * plain.sides.prod(1))
     assert plain.com == pytest.approx(np.zeros((len(plain), 3)))
     drawn = Bodies(density=(100.0, 1000.0), com_spread=0.2, seed=4)
-    made = drawn.stack(played, 1)
-    density = made.mass / made.sides.prod(1)
+    pile = drawn.stack(plans[1], 1)
+    density = pile.mass / pile.sides.prod(1)
     assert ((density >= 100) & (density <= 1000)).all()
     assert density.max() > 2 * density.min()
-    off = np.abs(made.com / made.sides)
+    off = np.abs(pile.com / pile.sides)
     assert off.max() <= 0.2
     assert off.max() > 0.1
-    again = drawn.stack(played, 1)
-    assert (again.mass == made.mass).all()
-    other = drawn.stack(played, 2)
-    assert not np.array_equal(other.com[:5], made.com[:5])
+    again = drawn.stack(plans[1], 1)
+    assert (again.mass == pile.mass).all()
+    other = drawn.stack(plans[1], 2)
+    assert not np.array_equal(other.com[:5], pile.com[:5])
 
 
 @pytest.mark.parametrize("named", [
@@ -294,7 +295,7 @@ def test_bodies_that_cannot_be_are_refused(named: dict[str, object]) -> None:
         Bodies(**named)  # type: ignore[arg-type]  # bad ones are meant
 
 
-def test_evaluate_tells_falls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_counts_falls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out.json"
     for rule, some in (("hull_alpha", False), ("none", True)):
         arguments = f"--policy dblf --rule {rule} --episodes 8 --physics --json {out}"
@@ -329,7 +330,7 @@ def test_saved_stacks_are_judged_and_drawn(
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".npz", ".png"]
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
+@pytest.mark.parametrize(("arguments", "why"), [
     ("stack nowhere.npz", "nowhere.npz"),
     ("table1 --objects 0", "--objects 0"),
     ("table1 --processes 0", "--processes 0"),
@@ -337,11 +338,11 @@ def test_saved_stacks_are_judged_and_drawn(
     ("controls --friction nan", "friction = nan"),
     ("table1 --json nowhere/x.json", "does not exist"),
 ])  # fmt: skip
-def test_what_the_command_cannot_do_is_told(
-    arguments: str, told: str, capsys: pytest.CaptureFixture[str]
+def test_what_the_command_cannot_do_is_refused(
+    arguments: str, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments.split()) == 2
-    assert told in capsys.readouterr().err
+    assert why in capsys.readouterr().err
 
 
 def test_table1_does_not_depend_on_the_processes_and_counts_falls(
@@ -363,21 +364,22 @@ def test_table1_does_not_depend_on_the_processes_and_counts_falls(
     shown = capsys.readouterr().out
     assert "hull_alpha, paper" in shown
     assert "hull_1, paper" not in shown  # it is not asked for
-    kept = load_stacks(tmp_path / "falls_none.npz")
-    assert len(kept.packed) == rows[0]["none"]["falls"]
-    judged = list(judge_all(Bodies(cell=table1.CELL).stacks(kept, range(len(kept.packed)))))
+    plans = load_plans(tmp_path / "falls_none.npz")
+    assert len(plans) == rows[0]["none"]["falls"]
+    assert all(plan.unit_mm == 1000 * table1.CELL for plan in plans)
+    judged = list(judge_all(Bodies().stacks(plans, range(len(plans)))))
     assert all(j.fall is not None for j in judged)
-    assert [j.placements for j in judged] == kept.packed.tolist()
+    assert [j.placements for j in judged] == [len(plan) for plan in plans]
 
 
 def test_a_film_shows_the_fall(tmp_path: Path) -> None:
-    made = controls.FAMILIES["box 10 times heavier on a light one"](-20.0).stack()
-    frames = list(film.simulate(made))
+    pile = Stack.of_plan(controls.FAMILIES["box 10 times heavier on a light one"](-20.0))
+    frames = list(film.simulate(pile))
     assert [len(f.middles) for f in frames[:1] + frames[-1:]] == [1, 3]
     assert frames[-1].moved
     assert frames[-1].middles[2, 2] == pytest.approx(0.05, abs=0.01)  # the heavy one is down
     path = tmp_path / "fall.gif"
-    assert film.render(made, path, "falls").moved
+    assert film.render(pile, path, "falls").moved
     shown = imageio.mimread(path)
     falling = sum(
         len(a.middles) == len(b.middles) and np.abs(b.middles - a.middles).max() > 0.002
@@ -387,24 +389,45 @@ def test_a_film_shows_the_fall(tmp_path: Path) -> None:
     assert falling < len(shown) < len(frames)  # frames in which nothing moves are one
     assert np.any(shown[0] != shown[-1])
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4"):
-        film.render(made, tmp_path / "fall.avi")
+        film.render(pile, tmp_path / "fall.avi")
     with pytest.raises(ValueError, match="no boxes"):
-        film.render(made.first(0), path)
+        film.render(pile.first(0), path)
 
 
-def test_a_file_whose_arrays_do_not_go_together_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "s.npz"
-    good = {"bin": np.array(BIN), "count": np.array([1]), "boxes": np.array([[FLAT]]),
-            "loads": np.array([[(32.0, 2, 2)]]), "utilization": np.array([0.032])}  # fmt: skip
-    np.savez(path, **good)
-    assert main(["stack", str(path)]) == 0
-    for name, value in (("count", [-1]), ("count", [2]), ("count", [1, 1]), ("bin", [10.5, 1, 1]),
-                        ("boxes", [[FLAT[:5]]]), ("loads", [[(1.0, 1)]])):  # fmt: skip
-        np.savez(path, **{**good, name: np.array(value)})
-        with pytest.raises(ValueError, match="do not go together"):
-            load_stacks(path)
-    np.savez(path, **{**good, "boxes": np.array([[(9, 0, 0, 2, 2, 2)]])})
-    assert main(["stack", str(path)]) == 2
+def test_a_plan_becomes_a_stack_in_its_own_unit() -> None:
+    boxes = [FLAT, (0, 0, 2, 2, 4, 1)]
+    loads = [(32.0, 2, 2), (3.0, 0.5, 3)]
+    plan = Plan.of_boxes(BIN, boxes, loads)
+    pile = Stack.of_plan(plan)
+    assert pile.size == pytest.approx([0.6, 0.6, 0.6])  # the paper's bin
+    assert pile.mass.tolist() == [32, 3]
+    assert pile.com / pile.sides == pytest.approx(np.array([(0, 0, 0), (-0.25, 0.25, 0)]))
+    own = Stack.of_plan(replace(plan, unit_mm=25.0), density=400.0, com_offset=(0, 0, 0.1))
+    assert own.size == pytest.approx([0.25, 0.25, 0.25])
+    assert own.mass == pytest.approx(400 * 0.025**3 * np.array([32, 8]))
+    assert own.com / own.sides == pytest.approx(np.array([(0, 0, 0.1)] * 2))
+    bodies = Bodies().stack(replace(plan, unit_mm=25.0), 0)
+    assert bodies.size == pytest.approx([0.25, 0.25, 0.25])
+    assert bodies.mass == pytest.approx(500 * 0.025**3 * np.array([32, 3]))
+
+
+def test_a_plan_of_several_bins_is_judged_bin_by_bin() -> None:
+    plan = Plan.of_boxes(BIN, [FLAT, (0, 0, 0, 2, 2, 2)][:1])
+    plan = replace(plan, bin_sizes=np.array([BIN, BIN]))
+    with pytest.raises(ValueError, match=r"2 bins: judge each, plan\.in_bin\(k\)"):
+        Stack.of_plan(plan)
+    assert [len(Stack.of_plan(plan.in_bin(k))) for k in (0, 1)] == [1, 0]
+
+
+def test_the_judge_imports_nothing_that_packs() -> None:
+    folder = Path(world_module.__file__).parent
+    imported = {
+        name
+        for path in folder.glob("*.py") if path.name != "__main__.py"
+        for name in re.findall(r"^ *from marl_pack\.([\w.]+) import", path.read_text(), re.M)
+    }  # fmt: skip
+    assert {name.split(".")[0] for name in imported} <= {"bins", "geometry", "plan", "files",
+                                                         "sapien_check"}  # fmt: skip
 
 
 def test_an_episode_is_named_with_its_box(
@@ -421,7 +444,7 @@ def test_an_episode_is_named_with_its_box(
 def test_without_sapien_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
-    from marl_pack.sapien_check.judge import load_sapien
+    from marl_pack.sapien_check.world import load_sapien
 
     load_sapien.cache_clear()
     monkeypatch.setitem(sys.modules, "sapien", None)

@@ -1,160 +1,39 @@
-"""What holds for every state: the rules' order, their symmetry, and equality of all codes."""
+"""Properties of every state: the rules' order and their symmetry."""
 
 import itertools
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import boxes_of, random_maps, random_play
+from conftest import boxes_of, off_centre, random_maps, random_play, some_items
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from test_backends import PLACES, expected
 
 from marl_pack import bins as state
-from marl_pack.bins import Bins, oriented
+from marl_pack.backend import Backend
+from marl_pack.bins import Bins
 from marl_pack.stability import (
     RULES,
     OrientedItem,
     equilibrium,
+    equilibrium_masks,
     hull_1,
     hull_alpha,
-    hull_cpu,
-    hull_torch,
     in_equilibrium,
     lbcp,
     make_rule,
     orient_item,
     reference,
     stable_mask,
-    static_equilibrium,
-    support_area,
 )
-from marl_pack.stability.load_bearing import _bearing_torch, lbcp_bearing
+from marl_pack.stability.reduced_equilibrium import UNSURE
 from marl_pack.stability.static_equilibrium import STRICT, least_force
 
-PLACES = [((5, 5, 6), (1, 4)), ((7, 4, 9), (1, 5)), ((10, 10, 10), (2, 5)), ((3, 8, 200), (1, 7))]
-
-
-def some_items(n: int, sides: tuple[int, int], seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short()
-
-
-def off_centre(items: Tensor, seed: int) -> OrientedItem:
-    """OrientedItem with a centre of mass anywhere in the middle half of each footprint."""
-    generator = torch.Generator().manual_seed(seed)
-    sides = oriented(items)
-    share = 0.25 + 0.5 * torch.rand(*sides.shape[:2], 2, generator=generator, dtype=torch.float64)
-    return OrientedItem(sides, share * sides[..., :2])
-
-
-# --- the batched codes against the plain reference ------------------------------------------------
-
-
-def expected(
-    bins: Bins, item: OrientedItem, stands: Callable[[int, int, int, int, int, int], bool]
-) -> np.ndarray:
-    """Every cell by ``stands(bin, candidate, x, y, w, d)``, in a loop."""
-    sides = item.sides.numpy()
-    return np.array(
-        [
-            [
-                reference.window_mask(
-                    lambda x, y, b=b, a=a, w=w, d=d: stands(b, a, x, y, w, d),
-                    bins.heightmap[b].numpy(),
-                    (w, d, h),
-                    bins.height,
-                )
-                for a, (w, d, h) in enumerate(sides[b].tolist())
-            ]
-            for b in range(len(bins))
-        ]
-    )
-
-
-@pytest.mark.parametrize(("size", "sides"), PLACES)
-@pytest.mark.parametrize("margin", [0.0, 0.5, 0.8])
-@pytest.mark.parametrize("com", ["central", "off centre"])
-@pytest.mark.parametrize("bearing", ["hull_1", "hull_alpha", "lbcp"])
-def test_hull_masks_equal_the_reference_cell_by_cell(
-    size: tuple[int, int, int], sides: tuple[int, int], margin: float, com: str, bearing: str
-) -> None:
-    bins = random_maps(12, size, sides, 12, seed=1)
-    items = some_items(12, sides, 2)
-    item = orient_item(items) if com == "central" else off_centre(items, 3)
-    holds = {
-        "hull_1": torch.ones_like(bins.empty_map, dtype=torch.bool),
-        "hull_alpha": bins.empty_map == 0,
-        "lbcp": torch.from_numpy(
-            np.array([reference.lbcp_bearing(size[:2], boxes_of(bins, b)) for b in range(12)])
-        ),
-    }[bearing]
-
-    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
-        window = np.s_[b, x : x + w, y : y + d]
-        centre = tuple(item.centres()[b, a].tolist())
-        return reference.hull(bins.heightmap.numpy()[window], holds.numpy()[window], centre, margin)
-
-    want = expected(bins, item, stands)
-    assert (make_rule(bearing, margin=margin)(bins, item).numpy() == want).all()
-    tensor = hull_torch.support_mask(
-        bins.heightmap, ~holds, item.sides, bins.height, item.com, margin
-    )
-    assert (tensor.numpy() == want).all()
-
-
-@pytest.mark.parametrize(("size", "sides"), PLACES)
-@pytest.mark.parametrize("thresholds", ["paper", "code"])
-def test_area_masks_equal_the_reference_cell_by_cell(
-    size: tuple[int, int, int], sides: tuple[int, int], thresholds: str
-) -> None:
-    bins = random_maps(12, size, sides, 12, seed=4)
-    item = orient_item(some_items(12, sides, 5))
-    pairs = support_area.check_thresholds(thresholds)
-
-    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
-        return reference.area_ratio(bins.heightmap[b, x : x + w, y : y + d].numpy(), pairs)
-
-    want = expected(bins, item, stands)
-    assert (make_rule("area_ratio", thresholds=thresholds)(bins, item).numpy() == want).all()
-    tensor = support_area.mask_torch(bins.heightmap, item.sides, bins.height, pairs)
-    assert (tensor.numpy() == want).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_load_bearing_maps_equal_the_reference_cell_by_cell(seed: int) -> None:
-    bins = random_maps(60, (8, 7, 25), (1, 6), 15, seed=seed)
-    compiled = lbcp_bearing(bins)
-    assert torch.equal(compiled, _bearing_torch(bins))
-    for b in range(60):
-        want = reference.lbcp_bearing((8, 7), boxes_of(bins, b))
-        assert (compiled[b].numpy() == want).all()
-    assert (compiled & (bins.empty_map > 0)).any()  # some gaps do carry
-
-
-@pytest.mark.parametrize("size", [(10, 10, 10), (40, 30, 50), (33, 64, 300)])
-def test_larger_maps_are_equal_on_cpu_and_tensor_code(size: tuple[int, int, int]) -> None:
-    longest = min(size) // 2
-    bins = random_maps(24, size, (2, longest), 25, seed=6)
-    for seed in range(3):
-        items = some_items(24, (2, longest), seed)
-        for item in (orient_item(items), off_centre(items, seed)):
-            for margin in (0.0, 1.3):
-                got = hull_cpu.support_mask(
-                    bins.heightmap.numpy(),
-                    bins.empty_map.numpy(),
-                    item.sides.numpy(),
-                    bins.height,
-                    None if item.com is None else item.com.numpy(),
-                    margin,
-                )
-                want = hull_torch.support_mask(
-                    bins.heightmap, bins.empty_map, item.sides, bins.height, item.com, margin
-                )
-                assert (got == want.numpy()).all()
+# --- the hull test against other codes ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("size", "sides"), PLACES)
@@ -166,10 +45,12 @@ def test_hull_alpha_equals_opencvs_hull_of_the_squares_corners(
 
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
         heights = bins.heightmap[b, x : x + w, y : y + d].numpy()
-        held = (heights == heights.max()) & (bins.empty_map[b, x : x + w, y : y + d].numpy() == 0)
-        if not held.any():
+        contact = (heights == heights.max()) & (
+            bins.empty_map[b, x : x + w, y : y + d].numpy() == 0
+        )
+        if not contact.any():
             return False
-        points = (2 * reference.corners(held)).astype(np.int32)  # half cells are whole
+        points = (2 * reference.corners(contact)).astype(np.int32)  # half cells are whole
         return cv2.pointPolygonTest(cv2.convexHull(points), (float(w), float(d)), False) > 0
 
     assert (hull_alpha(bins, item).numpy() == expected(bins, item, stands)).all()
@@ -186,18 +67,15 @@ def test_any_pattern_of_contact_is_judged_as_the_reference_does(
         torch.tensor([[[6, 6, 1]]], dtype=torch.int16),
         torch.tensor([[[x, y]]], dtype=torch.float64),
     )
-    bins = state.empty(1, (6, 6, 5), max_boxes=0)
-    bins.heightmap.copy_(heights)
     contact = cells if cells.any() else ~cells
     polygon = reference.convex_hull(reference.corners(contact))
     if abs(reference.clearance(polygon, (x, y)) - margin) < 1e-9:
-        return  # too close for floating point numbers to tell
-    want = reference.supported(contact, (x, y), margin)
-    assert bool(hull_1(bins, item, margin)[0, 0, 0, 0]) == want
-    tensor = hull_torch.support_mask(
-        heights, torch.zeros_like(heights), item.sides, 5, item.com, margin
-    )
-    assert bool(tensor[0, 0, 0, 0]) == want
+        return  # too close for floating point numbers to decide
+    for backend in Backend:
+        bins = state.empty(1, (6, 6, 5), max_boxes=0, backend=backend)
+        bins.heightmap.copy_(heights)
+        mask = hull_1(bins, item, margin)
+        assert bool(mask[0, 0, 0, 0]) == reference.supported(contact, (x, y), margin)
 
 
 # --- the order of the rules -----------------------------------------------------------------------
@@ -233,7 +111,8 @@ def test_the_order_holds_on_every_small_stack_of_three() -> None:
         allowed = equilibrium(bins, OrientedItem(sides[:, None]))[:, 0, 0]
         cell = torch.tensor([p[k][2] for p in pairs])
         stands = allowed.gather(1, cell[:, None]).squeeze(1)
-        state.place(bins, torch.where(stands[:, None], sides, 0), cell)
+        corner = torch.stack((torch.zeros_like(cell), cell), 1)
+        state.place(bins, torch.where(stands[:, None], sides, 0), corner)
     for kind in kinds:
         item = OrientedItem(torch.tensor(kind, dtype=torch.int16).expand(len(pairs), 1, 3))
         exact = equilibrium(bins, item)
@@ -271,7 +150,9 @@ def test_sound_rules_hold_whatever_the_centre_of_mass_is_if_it_is_known(rule: st
         allowed = bound(bins, item)[:, 0].flatten(1)
         cell = torch.multinomial(allowed.float() + 1e-12, 1, generator=generator)[:, 0]
         stands = allowed.gather(1, cell[:, None])
-        state.place(bins, torch.where(stands, item.sides[:, 0], 0), cell, com=item.centres()[:, 0])
+        corner = torch.stack((cell // 8, cell % 8), 1)
+        sides = torch.where(stands, item.sides[:, 0], 0)
+        state.place(bins, sides, corner, com=item.centres()[:, 0])
     for b in range(60):
         n = int(bins.count[b])
         assert in_equilibrium(bins.boxes[b, :n].numpy(), bins.loads[b, :n].numpy())
@@ -352,10 +233,8 @@ def test_stacks_that_try_the_simplex_hard(
     with np.load(Path(__file__).parent / "data" / "hard_stacks.npz") as archive:
         boxes = archive[name]
     heights, gaps = np.zeros(size[:2], int), np.zeros(size[:2], int)
-    for x, y, z, w, d, h in boxes[:-1]:
-        window = np.s_[x : x + w, y : y + d]
-        gaps[window] += z - heights[window]
-        heights[window] = z + h
+    for x, y, _, w, d, h in boxes[:-1].tolist():
+        reference.place_box(heights, gaps, (x, y), (w, d, h))
     last = boxes[-1]
     mask = stable_mask("equilibrium", heights, gaps, last[3:], size[2], boxes[:-1])
     assert mask[last[0], last[1]] == in_equilibrium(boxes) == verdict
@@ -368,9 +247,9 @@ def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.M
 
     def unsure(*arrays: np.ndarray) -> None:
         *_, band, verdict = arrays
-        verdict[band] = static_equilibrium.UNSURE
+        verdict[band] = UNSURE
 
-    monkeypatch.setattr(static_equilibrium, "_solve_band", unsure)
+    monkeypatch.setattr(equilibrium_masks, "_solve_band", unsure)
     assert torch.equal(equilibrium(bins, item), expected_mask)
 
 
@@ -395,14 +274,15 @@ def mirrored(bins: Bins) -> Bins:
     boxes[..., 0] = width - boxes[..., 0] - boxes[..., 3]
     loads[..., 1] = width - loads[..., 1]
     maps = bins.heightmap.flip(1), bins.empty_map.flip(1)
-    return Bins(*maps, boxes, loads, bins.count, bins.filled, bins.height)
+    return replace(bins, heightmap=maps[0], empty_map=maps[1], boxes=boxes, loads=loads)
 
 
 def transposed(bins: Bins) -> Bins:
     """The bins with x and y exchanged."""
     boxes, loads = bins.boxes[..., [1, 0, 2, 4, 3, 5]], bins.loads[..., [0, 2, 1]]
     maps = bins.heightmap.transpose(1, 2), bins.empty_map.transpose(1, 2)
-    return Bins(*(m.contiguous() for m in maps), boxes, loads, bins.count, bins.filled, bins.height)
+    heightmap, empty_map = (values.contiguous() for values in maps)
+    return replace(bins, heightmap=heightmap, empty_map=empty_map, boxes=boxes, loads=loads)
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -1,22 +1,33 @@
 """Augmentation by the bin's symmetries: transformed play is play in the transformed bin."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
-from marl_pack.agents import joint, orientation, placement
 from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
-from marl_pack.agents.learning.symmetry import carry, count, mean_probabilities, see, transform
 from marl_pack.agents.networks.actor_critic import make_actor
-from marl_pack.agents.networks.trunk import PLANES, Network
+from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.agents.networks.planes import PLANES
+from marl_pack.agents.networks.symmetry import (
+    count,
+    mean_probabilities,
+    mirror_actions,
+    mirror_observation,
+    transform,
+)
+from marl_pack.agents.networks.trunk import Network
 from marl_pack.game.packing import Packing
 
 SIZE = (6, 6, 8)
-CRITIC = AfterstateCritic()
+LOOKAHEAD = Lookahead(AfterstateCritic())
 
 
 def played(size: tuple[int, int, int]) -> Packing:
+    """Return games in which random play has placed five items."""
     game = Packing(64, size, sides=(1, 4), seed=5)
     policy = make_policy("random", 2)
     for _ in range(5):
@@ -25,6 +36,7 @@ def played(size: tuple[int, int, int]) -> Packing:
 
 
 def mirrored_map(heightmap: Tensor, symmetry: int) -> Tensor:
+    """Return maps [G, W, D] after one symmetry."""
     if symmetry & 1:
         heightmap = heightmap.flip(1)
     if symmetry & 2:
@@ -33,49 +45,49 @@ def mirrored_map(heightmap: Tensor, symmetry: int) -> Tensor:
 
 
 def in_mirrored_bin(game: Packing, symmetry: int) -> Packing:
-    """The same game in the mirrored bin: maps mirrored, the same items, masks made anew."""
+    """Return the same games in the mirrored bin: maps mirrored, the same items, masks computed."""
     size = (game.size[1], game.size[0], game.size[2]) if symmetry & 4 else game.size
     other = Packing(game.n, size, sides=(1, 4), seed=5)
     other.bins.heightmap.copy_(mirrored_map(game.bins.heightmap, symmetry))
     other.bins.empty_map.copy_(mirrored_map(game.bins.empty_map, symmetry))
     other.bins.filled.copy_(game.bins.filled)
-    other.items, other.weights = game.items, game.weights
-    other._look()
+    other.set_state(replace(other.state, items=game.items))
     return other
 
 
-def observed(agent: str, game: Packing, chosen: Tensor) -> dict[str, Tensor]:
-    """What the agent sees, the placement agent with these orientations."""
-    if agent == "placement":
-        return placement.observe(game, PLANES, chosen, afterstates=CRITIC)
-    return {"orientation": orientation, "joint": joint}[agent].observe(game, PLANES, CRITIC)
+def observed(agent: str, game: Packing, orientation: Tensor) -> dict[str, Tensor]:
+    """Return what the agent observes, the placement agent with these orientations."""
+    before = (orientation,) if agent == "placement" else ()
+    return observe(agent, game, tuple(PLANES), LOOKAHEAD, *before)
 
 
 @pytest.mark.parametrize("symmetry", range(8))
-@pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
+@pytest.mark.parametrize("agent", AGENT_KINDS)
 def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symmetry: int) -> None:
     game = played(SIZE)
     other = in_mirrored_bin(game, symmetry)
-    chosen, cell = make_policy("random", 3)(game)
-    turned = chosen ^ 1 if symmetry & 4 else chosen
-    cells = SIZE[0] * SIZE[1]
-    kinds = torch.full((game.n,), symmetry)
-    seen, expected = observed(agent, game, chosen), observed(agent, other, turned)
-    action = {"orientation": chosen, "placement": cell, "joint": chosen * cells + cell}[agent]
-    moved, new = transform(seen, action[:, None].float(), agent, kinds)
+    orientation, cell = make_policy("random", 3)(game)
+    rotated = orientation ^ 1 if symmetry & 4 else orientation
+    symmetries = torch.full((game.n,), symmetry)
+    observation = observed(agent, game, orientation)
+    expected = observed(agent, other, rotated)
+    pair = game.floor.pair(orientation, cell)
+    action = {"orientation": orientation, "placement": cell, "joint": pair}[agent]
+    mirrored, moved = transform(observation, action[:, None].float(), agent, symmetries)
+    assert mirrored.keys() == expected.keys()
     for name, values in expected.items():
-        if name.endswith("worth"):  # sums in another order
-            assert torch.allclose(moved[name], values, atol=1e-5), name
+        if name.endswith("afterstate_value"):  # sums in another order
+            assert torch.allclose(mirrored[name], values, atol=1e-5), name
         else:
-            assert torch.equal(moved[name], values), name
+            assert torch.equal(mirrored[name], values), name
     if agent == "orientation":
-        assert torch.equal(new.squeeze(1).long(), turned)
+        assert torch.equal(moved.squeeze(1).long(), rotated)
         return
-    # The box set down by the new action stands where the mirrored box would.
-    place = new.squeeze(1).long() % cells
+    # The box placed by the new action stands where the mirrored box would.
+    new_cell = moved.squeeze(1).long() % game.floor.cells
     before, after = game.bins.heightmap.clone(), other.bins.heightmap.clone()
-    game.place(chosen, cell)
-    other.place(turned, place)
+    game.place(orientation, cell)
+    other.place(rotated, new_cell)
     going_on = (game.t > 0) & (other.t > 0)
     raised = mirrored_map(game.bins.heightmap - before, symmetry)
     assert going_on.any()
@@ -84,17 +96,14 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
 
 def test_a_bin_that_is_not_square_is_mirrored() -> None:
     game = played((7, 5, 8))
-    seen = orientation.observe(game, PLANES, CRITIC)
-    action = torch.zeros(game.n, 1)
-    twice, _ = transform(
-        *transform(seen, action, "orientation", torch.full((game.n,), 3)),
-        "orientation",
-        torch.full((game.n,), 3),
-    )
-    assert all(torch.equal(twice[name], seen[name]) for name in seen)
+    observation = observed("orientation", game, torch.zeros(game.n, dtype=torch.int64))
+    action, symmetry = torch.zeros(game.n, 1), torch.full((game.n,), 3)
+    once = transform(observation, action, "orientation", symmetry)
+    twice, _ = transform(*once, "orientation", symmetry)
+    assert all(torch.equal(twice[name], observation[name]) for name in observation)
 
 
-@pytest.mark.parametrize("agent", ["orientation", "placement", "joint"])
+@pytest.mark.parametrize("agent", AGENT_KINDS)
 @pytest.mark.parametrize("size", [SIZE, (7, 5, 8)])
 def test_the_mean_over_the_symmetries_is_the_same_in_the_mirrored_bin(
     agent: str, size: tuple[int, int, int]
@@ -105,15 +114,16 @@ def test_the_mean_over_the_symmetries_is_the_same_in_the_mirrored_bin(
         for weight in actor.mlp.parameters():
             weight.normal_()
     game = played(size)
-    chosen, _ = make_policy("random", 3)(game)
-    seen = observed(agent, game, chosen)
-    here = mean_probabilities(actor, seen, agent)
+    orientation, _ = make_policy("random", 3)(game)
+    observation = observed(agent, game, orientation)
+    here = mean_probabilities(actor, observation, agent)
     assert torch.allclose(here.sum(1), torch.ones(game.n))
-    assert (here[~seen["mask"]] == 0).all()
-    assert not torch.allclose(here, actor.log_probs(seen).exp(), atol=0.01)
+    legal = observation["mask"]
+    assert (here[~legal] == 0).all()
+    assert not torch.allclose(here, actor.log_probs(observation).exp(), atol=0.01)
     actions = torch.arange(here.shape[1]).expand(game.n, -1)
     for symmetry in range(count(*size[:2])):
         kinds = torch.full((game.n,), symmetry)
-        there = mean_probabilities(actor, see(seen, agent, kinds), agent)
-        moved = carry(actions, seen["item"], size[:2], agent, kinds)
-        assert torch.allclose(there.gather(1, moved)[seen["mask"]], here[seen["mask"]], atol=1e-5)
+        there = mean_probabilities(actor, mirror_observation(observation, agent, kinds), agent)
+        moved = mirror_actions(actions, observation["item"], size[:2], agent, kinds)
+        assert torch.allclose(there.gather(1, moved)[legal], here[legal], atol=1e-5)

@@ -1,4 +1,4 @@
-"""The command that trains: stopping, going on, several processes, what it leaves behind."""
+"""The command that trains: stopping, resuming, several processes, what it writes."""
 
 import csv
 import json
@@ -13,12 +13,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_runs import same
 from torch import Tensor
 
-from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.train import main
 
+VALUES = tuple(
+    f"--{agent}.network.planes=[mask,afterstate_value]" for agent in ("orientation", "placement")
+)
 SMALL = (
     "--game.bin=[5,5,5]", "--game.sides=[1,3]", "--ppo.num_envs=8", "--ppo.num_steps_per_env=4",
     "--ppo.num_mini_batches=2", "--orientation.network.channels=8", "--output.latest_every=1",
@@ -28,12 +32,13 @@ SMALL = (
 
 
 def networks(run: Path) -> dict[str, Tensor]:
-    agents = checkpoint.read(run / "latest.pt")["agents"]
+    agents = checkpoints.read(run / "latest.pt")["agents"]
     return {f"{a}.{n}": v for a, s in agents.items() for n, v in s["actor_state_dict"].items()}
 
 
-def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+def critic(run: Path) -> dict[str, Tensor]:
+    weights: dict[str, Tensor] = checkpoints.read(run / "latest.pt")["afterstate_critic"]
+    return weights
 
 
 def start(*options: str, python: tuple[str, ...] = ()) -> subprocess.Popen[str]:
@@ -49,7 +54,7 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
             return
         assert process.poll() is None, process.stdout and process.stdout.read()
         time.sleep(0.05)
-    raise AssertionError(f"{path} did not come")
+    raise AssertionError(f"{path} was not written")
 
 
 def test_a_run_leaves_settings_checkpoints_logs_and_history(
@@ -66,11 +71,11 @@ def test_a_run_leaves_settings_checkpoints_logs_and_history(
     rows = list(csv.DictReader((run / "evaluations.csv").open()))
     assert [row["iteration"] for row in rows] == ["2", "4"]
     assert [row["items"] for row in rows] == ["64", "128"]
-    found = checkpoint.read(run)
-    assert found["items"] in (64, 128)
+    best = checkpoints.read(run)
+    assert best["items"] in (64, 128)
     assert max(float(row["utilization"]) for row in rows) == pytest.approx(
-        found["evaluations"][-1]["utilization"]
-        if found["items"] == int(rows[-1]["items"])
+        best["evaluations"][-1]["utilization"]
+        if best["items"] == int(rows[-1]["items"])
         else float(rows[0]["utilization"])
     )
     shown = capsys.readouterr().out
@@ -84,8 +89,7 @@ def test_a_run_leaves_settings_checkpoints_logs_and_history(
 def test_tensorboards_scalars_are_those_that_the_docs_define(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    worth = "--placement.network.planes=[mask,worth]"
-    assert main([*SMALL, worth, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
+    assert main([*SMALL, VALUES[1], "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
     docs = (Path(__file__).parent.parent / "docs" / "training.md").read_text(encoding="utf-8")
@@ -97,17 +101,18 @@ def test_tensorboards_scalars_are_those_that_the_docs_define(tmp_path: Path) -> 
     assert last.step == 3
 
 
-def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
-    options = [*SMALL, "--ppo.max_iterations=12"]
+def test_a_killed_run_resumes_to_the_same_weights(tmp_path: Path) -> None:
+    options = [*SMALL, *VALUES, "--ppo.max_iterations=12"]
     assert main([*options, f"--output.folder={tmp_path / 'whole'}"]) == 0
     process = start(*options, f"--output.folder={tmp_path / 'part'}")
     run = tmp_path / "part" / "run"
     wait_for(run / "model_4.pt", process)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert checkpoint.read(run / "latest.pt")["iter"] < 11
+    assert checkpoints.read(run / "latest.pt")["iter"] < 11
     assert main(["--resume", str(run)]) == 0
     assert same(networks(run), networks(tmp_path / "whole" / "run"))
+    assert same(critic(run), critic(tmp_path / "whole" / "run"))
     columns = ("iteration", "items", "utilization")
     histories = [
         [[row[c] for c in columns] for row in csv.DictReader((path / "evaluations.csv").open())]
@@ -125,7 +130,7 @@ def test_an_interrupt_ends_with_a_checkpoint(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert f"--resume {run}" in out.replace("\n", "")
     assert "Traceback" not in out
-    assert checkpoint.read(run / "latest.pt")["iter"] >= 2
+    assert checkpoints.read(run / "latest.pt")["iter"] >= 2
 
 
 def test_a_run_may_be_made_longer_but_not_another(
@@ -134,12 +139,12 @@ def test_a_run_may_be_made_longer_but_not_another(
     assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
     run = str(tmp_path / "run")
     assert main(["--resume", run, "--game.bin=[6,6,6]"]) == 2
-    told = capsys.readouterr().err
-    assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in told
+    message = capsys.readouterr().err
+    assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in message
     assert main(["--resume", run, "--ppo.max_iterations=1"]) == 2
     assert "has done 2 already" in capsys.readouterr().err
     assert main(["--resume", run, "--ppo.max_iterations=3"]) == 0
-    assert checkpoint.read(Path(run) / "latest.pt")["iter"] == 2
+    assert checkpoints.read(Path(run) / "latest.pt")["iter"] == 2
     assert main(["--resume", run, "--config=configs/rs.yaml"]) == 2
     assert main(["--resume", str(tmp_path / "nothing")]) == 2
     assert "no such checkpoint" in capsys.readouterr().err
@@ -152,28 +157,28 @@ def test_weights_and_biases_get_the_settings_and_the_scalars(
     """With a stand-in for the package, which needs an account."""
     from rsl_rl.utils import wandb_log_writer
 
-    told: dict[str, object] = {}
+    logged: dict[str, object] = {}
 
     class Settings:
         def update(self, values: dict[str, object]) -> None:
-            told.update(values)
+            logged.update(values)
 
     class Wandb:
         config = Settings()
 
         def __getattr__(self, name: str) -> object:
-            return lambda *args, **named: told.update(args[0]) if name == "log" else None
+            return lambda *args, **named: logged.update(args[0]) if name == "log" else None
 
     monkeypatch.setattr(wandb_log_writer, "wandb", Wandb())
     options = [*SMALL, "--ppo.max_iterations=2", "--output.logger=wandb"]
     assert main([*options, f"--output.folder={tmp_path}"]) == 0
-    assert told["env_cfg"]["game"]["bin"] == [5, 5, 5]
-    assert "Train/utilization" in told
+    assert logged["env_cfg"]["game"]["bin"] == [5, 5, 5]
+    assert "Train/utilization" in logged
     monkeypatch.setattr(wandb_log_writer, "wandb", None)
     assert main([*options, f"--output.folder={tmp_path / 'without'}"]) == 2
 
 
-def test_a_run_that_diverges_says_so_and_keeps_its_last_checkpoint(
+def test_a_run_that_diverges_reports_it_and_keeps_its_last_checkpoint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wild = ["--ppo.learning_rate=1e30", "--ppo.max_iterations=9", "--evaluation.every=0"]
@@ -195,7 +200,7 @@ def test_a_file_of_one_sequence_is_trained_on_and_options_are_not_abbreviated(
     )
 
 
-def test_a_run_takes_over_no_folder_and_leaves_none_behind_that_it_did_not_use(
+def test_a_run_uses_no_folder_with_files_and_leaves_none_that_it_did_not_use(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "run").mkdir()
@@ -220,19 +225,19 @@ def test_a_run_begins_with_the_weights_of_another(
     assert main([*again, "--ppo.max_iterations=1", "--ppo.learning_rate=1e-12"]) == 0
     second = networks(tmp_path / "again" / "run")
     assert all(torch.allclose(first[name], second[name], atol=1e-9) for name in first)
-    assert checkpoint.read(tmp_path / "again" / "run")["items"] == 32  # its own alone
+    assert checkpoints.read(tmp_path / "again" / "run")["items"] == 32  # its own alone
     capsys.readouterr()
     assert main([*again, "--orientation.network.layers=2", "--output.name=other"]) == 2
     assert "orientation agent has another network: {'layers': 3}" in capsys.readouterr().err
-    more = "--placement.network.planes=[filled,mask,rest,waste]"
+    more = "--placement.network.planes=[filled,mask,resting_height,waste]"
     assert main([*again, more, "--ppo.max_iterations=1", "--output.name=more"]) == 0
     fewer = (f"--init={tmp_path / 'again' / 'more'}", "--ppo.max_iterations=1")
     assert main([*again, *fewer, "--output.name=fewer"]) == 2
     assert "placement agent has another network: {'planes': [" in capsys.readouterr().err
-    kept = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
-    for agent in kept["agents"].values():
+    best = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
+    for agent in best["agents"].values():
         del agent["network"]["dilation"]  # as in checkpoints of versions that did not have it
-    torch.save(kept, tmp_path / "old.pt")
+    torch.save(best, tmp_path / "old.pt")
     old = (*SMALL, f"--init={tmp_path / 'old.pt'}", f"--output.folder={tmp_path / 'again'}")
     assert main([*old, "--placement.network.dilation=2", "--output.name=other"]) == 2
     assert "placement agent has another network: {'dilation': 1}" in capsys.readouterr().err
@@ -246,15 +251,15 @@ def test_a_run_begins_with_the_weights_of_another(
         shutil.rmtree(tmp_path / "frozen")
 
 
-def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:
-    """A checkpoint is there before the first iteration, and on resuming holds what is new."""
-    begun: list[int] = []
+def test_a_run_can_be_resumed_from_its_very_start(tmp_path: Path) -> None:
+    """A checkpoint is there before the first iteration; after resuming it has new settings."""
+    starts: list[int] = []
 
     class StoppedError(Exception):
         pass
 
     def stop(self: Runner, iterations: int, **named: object) -> None:
-        begun.append(iterations)
+        starts.append(iterations)
         raise StoppedError
 
     whole = [*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path / 'whole'}"]
@@ -267,8 +272,8 @@ def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:
             main(options)
         with pytest.raises(StoppedError):
             main(["--resume", str(run), "--ppo.max_iterations=2"])
-    assert begun == [1, 2]
-    assert checkpoint.read(run / "latest.pt")["iter"] == -1
+    assert starts == [1, 2]
+    assert checkpoints.read(run / "latest.pt")["iter"] == -1
     assert main(["--resume", str(run)]) == 0
     assert same(networks(run), networks(tmp_path / "whole" / "run"))
 
@@ -276,17 +281,17 @@ def test_a_run_can_be_gone_on_with_from_its_very_start(tmp_path: Path) -> None:
 def test_evaluations_on_other_sequences_are_not_compared(tmp_path: Path) -> None:
     assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
     run = tmp_path / "run"
-    found = checkpoint.read(run / "latest.pt")
-    found["evaluations"][0]["utilization"] = 2.0  # better than any other can be
-    checkpoint.write(run / "latest.pt", found)
+    latest = checkpoints.read(run / "latest.pt")
+    latest["evaluations"][0]["utilization"] = 2.0  # better than any other can be
+    checkpoints.write(run / "latest.pt", latest)
     assert main(["--resume", str(run), "--ppo.max_iterations=4"]) == 0
-    assert checkpoint.read(run / "best.pt")["iter"] == 1
+    assert checkpoints.read(run / "best.pt")["iter"] == 1
     more = ["--resume", str(run), "--ppo.max_iterations=6", "--evaluation.seed=7"]
     assert main(more) == 0
-    assert checkpoint.read(run / "best.pt")["iter"] == 5
+    assert checkpoints.read(run / "best.pt")["iter"] == 5
 
 
-def test_a_changed_file_of_items_is_not_gone_on_with(
+def test_a_run_is_not_resumed_with_a_changed_file_of_items(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     items = tmp_path / "items.json"
@@ -308,16 +313,16 @@ def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Pat
         "import os, sys, torch\n"
         "from marl_pack import train\n"
         "from marl_pack.agents.learning.runner import Runner\n"
-        "learned = Runner.train\n"
-        "def keep(self, iterations):\n"
-        "    learned(self, iterations)\n"
-        "    kept = {'weights': self.alg.save(), 'items': self.env.game.items}\n"
-        f"    torch.save(kept, r'{tmp_path}/rank' + os.environ['RANK'])\n"
-        "Runner.train = keep\n"
+        "train_alone = Runner.train\n"
+        "def train_and_save(self, iterations):\n"
+        "    train_alone(self, iterations)\n"
+        "    result = {'weights': self.alg.save(), 'items': self.env.game.items.sides}\n"
+        f"    torch.save(result, r'{tmp_path}/rank' + os.environ['RANK'])\n"
+        "Runner.train = train_and_save\n"
         "sys.exit(train.main(sys.argv[1:]))\n"
     )
     environment = dict(os.environ, OMP_NUM_THREADS="1")
-    options = [*SMALL, "--ppo.max_iterations=3", f"--output.folder={tmp_path}"]
+    options = [*SMALL, *VALUES, "--ppo.max_iterations=3", f"--output.folder={tmp_path}"]
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2",
                 f"--master_port={port}", str(script)]  # fmt: skip
     done = subprocess.run([*torchrun, *options], env=environment, capture_output=True, text=True,
@@ -328,10 +333,47 @@ def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Pat
     for agent, state in ranks[0]["weights"]["learners"].items():
         for part in ("actor_state_dict", "critic_state_dict"):
             assert same(state[part], ranks[1]["weights"]["learners"][agent][part])
-    found = checkpoint.read(tmp_path / "run" / "latest.pt")
-    assert found["items"] == 2 * 3 * 8 * 4
-    assert len(found["state"]) == 2
+    first, second = (rank["weights"]["afterstate_critic"] for rank in ranks)
+    assert same(first, second)
+    latest = checkpoints.read(tmp_path / "run" / "latest.pt")
+    assert same(latest["afterstate_critic"], first)
+    assert latest["items"] == 2 * 3 * 8 * 4
+    assert len(latest["state"]) == 2
     more = subprocess.run([*torchrun, "--resume", str(tmp_path / "run"), "--ppo.max_iterations=4"],
                           env=environment, capture_output=True, text=True, timeout=300)  # fmt: skip
     assert more.returncode == 0, more.stdout + more.stderr
+    resumed = [
+        torch.load(tmp_path / f"rank{rank}", weights_only=True)["weights"]["afterstate_critic"]
+        for rank in (0, 1)
+    ]
+    assert same(*resumed)
+    assert not same(first, resumed[0])
     assert main(["--resume", str(tmp_path / "run"), "--ppo.max_iterations=5"]) == 2
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (["--placement.imitate=dblf"],
+     "unknown key placement.imitate: it is now called placement.teacher"),
+    (["--orientation.imitate_iterations=5"], "it is now called orientation.teacher_iterations"),
+    (["--orientation.network.planes=[mask,worth]"],
+     "plane 'worth' is now called 'afterstate_value'"),
+    (["--placement.frozen=true", "--placement.policy=most_room"],
+     "placement.policy: policy 'most_room' is now called 'max_feasible'"),
+    (["--placement.teacher=most_room", "--placement.teacher_iterations=5"],
+     "placement.teacher: policy 'most_room' is now called 'max_feasible'"),
+])  # fmt: skip
+def test_an_old_name_is_refused_with_the_new_one(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*SMALL, *options, f"--output.folder={tmp_path}"]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_old_key_in_a_file_is_refused_with_the_new_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "old.yaml"
+    path.write_text("placement:\n  imitate: dblf\n", encoding="utf-8")
+    assert main([f"--config={path}"]) == 2
+    assert "placement.imitate: it is now called placement.teacher" in capsys.readouterr().err

@@ -6,123 +6,153 @@ equal after a heuristic's own keys goes to the first orientation, then to the fi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from marl_pack import renamed
 from marl_pack.agents.afterstates.afterstates import MOST_LENGTHS
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.policy import (
-    Choice,
     OrientationAgent,
+    Placement,
     PlacementAgent,
     Policy,
     draw,
     in_turns,
 )
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
-from marl_pack.stability.windows import rest_and_waste
+from marl_pack.geometry import resting_heights_and_waste
+
+Keys = Sequence[tuple[Tensor, int]]
+"""Whole numbers broadcastable to [G, 6, W, D], each with a bound that it stays below; the first key
+decides, the next ones break ties."""
+
+
+class Candidates:
+    """Every placement of each visible item, legal or not; tensors broadcast to [G, 6, W, D].
+
+    Args:
+        game: the games.
+        lookahead: what placements leave.
+    """
+
+    def __init__(self, game: Packing, lookahead: Lookahead) -> None:
+        self.game, self.lookahead = game, lookahead
+        self.size = game.size
+        self.sides = game.orient_item(game.items).sides  # int16 [G, 6, 3]
+        self.x = torch.arange(game.size[0], device=game.device)[:, None]  # int64 [W, 1]
+        self.y = torch.arange(game.size[1], device=game.device)[None, :]  # int64 [1, D]
+
+    def _windows(self, waste: bool) -> tuple[Tensor, Tensor]:
+        bins = self.game.bins
+        return resting_heights_and_waste(
+            bins.heightmap, self.sides, bins.height, waste=waste, backend=bins.backend
+        )
+
+    @cached_property
+    def _both(self) -> tuple[Tensor, Tensor]:
+        """Resting heights and wasted cells."""
+        return self._windows(waste=True)
+
+    @cached_property
+    def z(self) -> Tensor:
+        """Resting heights, int64 [G, 6, W, D]."""
+        if "_both" in vars(self):
+            return self._both[0].long()
+        return self._windows(waste=False)[0].long()
+
+    @cached_property
+    def waste(self) -> Tensor:
+        """Empty cells that would be enclosed below the item, int64 [G, 6, W, D]."""
+        return self._both[1].long()
+
+    @cached_property
+    def top(self) -> Tensor:
+        """Heights of the item's top, at most H, int64 [G, 6, W, D]."""
+        return (self.z + self.sides[..., 2, None, None]).clamp(max=self.size[2])
+
+    @cached_property
+    def feasible_cells(self) -> Tensor:
+        """Mean number of cells left for a box that may come, float32 [G, 6, W, D]."""
+        return self.lookahead.feasible_cells(self.game)
 
 
 @dataclass(frozen=True)
-class View:
-    """Every way to set each item down, whether legal or not; broadcastable to [N, 6, W, D]."""
-
-    w: Tensor  # int64 [N, 6, 1, 1]   sides along x, y, z
-    d: Tensor
-    h: Tensor
-    x: Tensor  # int64 [W, 1]         low corner
-    y: Tensor  # int64 [1, D]
-    z: Tensor  # int64 [N, 6, W, D]   resting height
-    waste: Tensor  # int64 [N, 6, W, D]   empty cells enclosed below; none unless asked for
-    size: tuple[int, int, int]
-
-
-def _view(game: Packing, waste: bool = False) -> View:
-    sides = game.orient_item(game.items, game.weights).sides
-    w, d, h = (sides[..., k, None, None].long() for k in range(3))
-    z, wasted = rest_and_waste(game.bins, sides, waste=waste)
-    x = torch.arange(game.size[0], device=game.device)[:, None]
-    y = torch.arange(game.size[1], device=game.device)[None, :]
-    return View(w, d, h, x, y, z.long(), wasted.long(), game.size)
-
-
-def _least(game: Packing, mask: Tensor | None, *keys: tuple[Tensor, int]) -> Choice:
-    """The legal (orientation, cell) that is least in the first key, then in the next ones.
+class Heuristic:
+    """A policy that takes the legal placement with the least keys.
 
     Args:
-        game: N bins.
-        mask: bool [N, 6, W, D], what may be chosen; all that is legal by default.
-        *keys: whole numbers broadcastable to [N, 6, W, D], each with a bound it stays below.
+        keys: the placements' keys.
     """
-    rank = torch.zeros_like(game.mask, dtype=torch.int64)
-    for value, bound in keys:
-        rank = rank * bound + value
-    legal = game.mask if mask is None else mask
-    rank = torch.where(legal, rank, torch.iinfo(torch.int64).max)
-    best = rank.flatten(1).argmin(1)  # the first of equals
-    cells = game.size[0] * game.size[1]
-    return best // cells, best % cells
+
+    keys: Callable[[Candidates], Keys]
+
+    def __call__(
+        self, game: Packing, legal: Moves | None = None, lookahead: Lookahead | None = None
+    ) -> Placement:
+        """Return orientation and cell of the best placement, int64 [G] each.
+
+        Args:
+            game: the games.
+            legal: what may be chosen; all that is legal by default.
+            lookahead: what placements leave; computed if not given.
+        """
+        rank = torch.zeros_like(game.mask, dtype=torch.int64)
+        for value, bound in self.keys(Candidates(game, lookahead or Lookahead())):
+            rank = rank * bound + value
+        return (legal or game.moves).least(rank)
 
 
-def dblf(game: Packing, mask: Tensor | None = None) -> Choice:
+def _dblf(c: Candidates) -> Keys:
     """Deepest, bottom, left (Karabulut & İnceoğlu 2004): lowest z, then x, then y."""
-    v = _view(game)
-    return _least(game, mask, (v.z, v.size[2] + 1), (v.x, v.size[0]), (v.y, v.size[1]))
+    return (c.z, c.size[2] + 1), (c.x, c.size[0]), (c.y, c.size[1])
 
 
-def height_min(game: Packing, mask: Tensor | None = None) -> Choice:
+def _height_min(c: Candidates) -> Keys:
     """Heightmap minimisation (Wang & Hauser 2021): least c · (x + y) + sum of the new heightmap.
 
     With c small, as they have it: the sum decides, x + y breaks ties. Since the item's volume is
     given, the sum is least where least space is enclosed.
     """
-    v = _view(game, waste=True)
-    width, depth, height = v.size
-    return _least(game, mask, (v.waste, width * depth * height), (v.x + v.y, width + depth))
+    width, depth, height = c.size
+    return (c.waste, width * depth * height), (c.x + c.y, width + depth)
 
 
-def best_fit(game: Packing, mask: Tensor | None = None) -> Choice:
+def _best_fit(c: Candidates) -> Keys:
     """Best fit by wasted space: fewest empty cells enclosed, then the lowest top, then x + y."""
-    v = _view(game, waste=True)
-    width, depth, height = v.size
-    return _least(
-        game,
-        mask,
-        (v.waste, width * depth * height),
-        ((v.z + v.h).clamp(max=height), height + 1),
-        (v.x + v.y, width + depth),
-    )
+    width, depth, height = c.size
+    return (c.waste, width * depth * height), (c.top, height + 1), (c.x + c.y, width + depth)
 
 
-def most_room(game: Packing, mask: Tensor | None = None) -> Choice:
-    """The placement that leaves the next item most: see :meth:`Packing.room`.
+def _max_feasible(c: Candidates) -> Keys:
+    """Most room for what may come: see :meth:`Lookahead.feasible_cells`.
 
-    Greatest mean number of cells where a box that may come next could be set down, then the lowest
+    Greatest mean number of cells where a box that may come next could be placed, then the lowest
     top, then x + y.
     """
-    v = _view(game)
-    width, depth, height = v.size
+    width, depth, height = c.size
     most = width * depth * MOST_LENGTHS**3
-    room = (game.room()[0].double() * MOST_LENGTHS**3).round().long()
-    return _least(
-        game,
-        mask,
-        (most - room, most + 1),
-        ((v.z + v.h).clamp(max=height), height + 1),
-        (v.x + v.y, width + depth),
-    )
+    cells = (c.feasible_cells.double() * MOST_LENGTHS**3).round().long()
+    return (most - cells, most + 1), (c.top, height + 1), (c.x + c.y, width + depth)
 
 
-HEURISTICS: dict[str, Callable[[Packing, Tensor | None], Choice]] = {
+dblf = Heuristic(_dblf)
+height_min = Heuristic(_height_min)
+best_fit = Heuristic(_best_fit)
+max_feasible = Heuristic(_max_feasible)
+
+HEURISTICS: dict[str, Heuristic] = {
     "dblf": dblf,
     "height_min": height_min,
     "best_fit": best_fit,
-    "most_room": most_room,
+    "max_feasible": max_feasible,
 }
-"""Name -> function of the game and of what may be chosen, all that is legal if None."""
+"""Every heuristic by its name."""
 
 POLICIES = (*HEURISTICS, "random")
 """Names of :func:`make_policy`, and of :func:`make_placement_agent`."""
@@ -132,7 +162,7 @@ ORIENTATION_AGENTS = (*POLICIES, "first")
 
 
 def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "cpu") -> Policy:
-    """The policy called ``name``, for games on ``device``.
+    """Return the policy called ``name``, for games on ``device``.
 
     Args:
         name: a heuristic, or ``random``: uniform among the legal orientations, then uniform among
@@ -144,24 +174,27 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
         ValueError: for an unknown name.
     """
     if name in HEURISTICS:
-        heuristic = HEURISTICS[name]
-        return lambda game: heuristic(game, None)
+        return HEURISTICS[name]
     if name != "random":
-        raise ValueError(f"unknown policy {name!r}: one of {', '.join(POLICIES)}")
+        raise _unknown("policy", name, POLICIES)
     generator = _generator(seed, device)
     return in_turns(
         lambda game: draw(game.orientation_mask, generator),
-        lambda game, orientation: draw(game.orient(orientation).mask.flatten(1), generator),
+        lambda game, orientation: draw(game.moves.of(orientation).flatten(1), generator),
     )
 
 
 def make_orientation_agent(
-    name: str, seed: int | None = 0, device: torch.device | str = "cpu"
+    name: str,
+    seed: int | None = 0,
+    device: torch.device | str = "cpu",
+    lookahead: Lookahead | None = None,
 ) -> OrientationAgent:
-    """The first agent alone: ``random``, ``first`` or what a heuristic would choose.
+    """Return the first agent alone: ``random``, ``first`` or what a heuristic would choose.
 
     ``first`` leaves the item as it comes (orientation 0), or takes the first orientation that may
-    be chosen where it could not stand so. Arguments as :func:`make_policy`.
+    be chosen where that has no place. Arguments as :func:`make_policy`; ``lookahead`` is shared
+    with the other agent.
 
     Raises:
         ValueError: for an unknown name.
@@ -173,34 +206,39 @@ def make_orientation_agent(
         return lambda game: draw(game.orientation_mask, generator)
     if name in HEURISTICS:
         heuristic = HEURISTICS[name]
-        return lambda game: heuristic(game, None)[0]
-    raise ValueError(f"unknown orientation agent {name!r}: one of {', '.join(ORIENTATION_AGENTS)}")
+        return lambda game: heuristic(game, None, lookahead)[0]
+    raise _unknown("orientation agent", name, ORIENTATION_AGENTS)
 
 
 def make_placement_agent(
-    name: str, seed: int | None = 0, device: torch.device | str = "cpu"
+    name: str,
+    seed: int | None = 0,
+    device: torch.device | str = "cpu",
+    lookahead: Lookahead | None = None,
 ) -> PlacementAgent:
-    """The second agent alone: ``random``, or a heuristic among the cells of the orientation.
+    """Return the second agent alone: ``random``, or a heuristic among the cells that are left.
 
-    Arguments as :func:`make_policy`.
+    Arguments as :func:`make_orientation_agent`.
 
     Raises:
         ValueError: for an unknown name.
     """
     if name == "random":
         generator = _generator(seed, device)
-        return lambda game, orientation: draw(game.orient(orientation).mask.flatten(1), generator)
+        return lambda game, orientation: draw(game.moves.of(orientation).flatten(1), generator)
     if name in HEURISTICS:
         heuristic = HEURISTICS[name]
-        return lambda game, orientation: heuristic(game, _only(game, orientation))[1]
-    raise ValueError(f"unknown placement agent {name!r}: one of {', '.join(POLICIES)}")
+        return lambda game, orientation: heuristic(game, game.moves.only(orientation), lookahead)[1]
+    raise _unknown("placement agent", name, POLICIES)
+
+
+def _unknown(kind: str, name: str, names: Sequence[str]) -> ValueError:
+    try:
+        renamed.refuse_old(name, renamed.POLICIES, kind)
+    except ValueError as error:
+        return error
+    return ValueError(f"unknown {kind} {name!r}: one of {', '.join(names)}")
 
 
 def _generator(seed: int | None, device: torch.device | str) -> torch.Generator | None:
     return None if seed is None else torch.Generator(device).manual_seed(seed % 2**63)
-
-
-def _only(game: Packing, orientation: Tensor) -> Tensor:
-    """The mask [N, 6, W, D] with the cells of ``orientation`` [N] alone."""
-    chosen = nn.functional.one_hot(orientation, len(ORIENTATIONS)).bool()
-    return game.mask & chosen[:, :, None, None]

@@ -1,4 +1,4 @@
-"""What every player is: a function from the game to an orientation and a cell for each bin."""
+"""What every player is: a function from the game to an orientation and a cell for each game."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from torch import Tensor
 
 from marl_pack.game.packing import Packing
 
-Choice = tuple[Tensor, Tensor]
-"""(orientation int64 [N], cell int64 [N])."""
+Placement = tuple[Tensor, Tensor]
+"""(orientation int64 [G], cell int64 [G])."""
 
-Policy = Callable[[Packing], Choice]
+Policy = Callable[[Packing], Placement]
 """``game -> (orientation, cell)``, legal wherever ``game.alive``.
 
 Networks, heuristics and random play are all of this form, so one loop plays them all."""
 
 OrientationAgent = Callable[[Packing], Tensor]
-"""``game -> orientation int64 [N]``: the first agent alone."""
+"""``game -> orientation int64 [G]``: the first agent alone."""
 
 PlacementAgent = Callable[[Packing, Tensor], Tensor]
-"""``(game, orientation int64 [N]) -> cell int64 [N]``: the second agent alone."""
+"""``(game, orientation int64 [G]) -> cell int64 [G]``: the second agent alone."""
 
 
 def in_turns(orientation_agent: OrientationAgent, placement_agent: PlacementAgent) -> Policy:
-    """The policy of two agents, wherever each comes from."""
+    """Return the policy of two agents, wherever each comes from."""
 
-    def play(game: Packing) -> Choice:
+    def play(game: Packing) -> Placement:
         orientation = orientation_agent(game)
         return orientation, placement_agent(game, orientation)
 
@@ -35,14 +35,14 @@ def in_turns(orientation_agent: OrientationAgent, placement_agent: PlacementAgen
 
 
 def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """One index drawn uniformly from the true entries of each row; 0 where there are none.
+    """Draw one index uniformly from the true entries of each row; 0 where there are none.
 
     Args:
-        mask: bool [N, K].
+        mask: bool [G, K].
         generator: of the random numbers, on the mask's device; torch's global one by default.
 
     Returns:
-        int64 [N].
+        int64 [G].
     """
     # Inverse CDF: several times cheaper than torch.multinomial.
     count = mask.cumsum(1, dtype=torch.int32)

@@ -1,18 +1,19 @@
-"""The packing game: N bins at once, two turns an item.
+"""The rules of the packing game: G games at once, two turns an item.
 
-The item on each conveyor is turned (:meth:`Packing.orient`), then set down (:meth:`Packing.place`).
-One mask [N, 6, W, D] is made when an item arrives and serves both turns: the orientation agent sees
-which orientations have a cell, the placement agent the cells of the chosen one, so a legal
-orientation never leaves the placement without a legal cell. An episode ends when the visible item
-has no legal cell in any orientation, or when its stream has no more items.
+First the visible item of each game gets an orientation (:meth:`Packing.orient`), then a place
+(:meth:`Packing.place`). One mask [G, 6, W, D] is made when an item arrives and serves both turns:
+the orientation agent chooses among the orientations with a legal cell, the placement agent among
+the cells of the chosen one, so a legal orientation never leaves the placement without a legal cell.
+An episode ends when the visible item has no legal cell in any orientation, when its stream has no
+more items, or when the bin holds as many as it may.
 """
 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, fields
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,387 +21,411 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from marl_pack import bins as state
-from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
-from marl_pack.bins import ORIENTATIONS, check_device, check_size
-from marl_pack.items import DEFAULT_SIDES, Stream, fingerprint, make_stream
-from marl_pack.stability import OrientedItem, Rule, make_rule, orient_item
-from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset
-
-ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
+from marl_pack import bins as bin_state
+from marl_pack.backend import Backend, default_backend
+from marl_pack.bins import Bins, check_device, orientation_table
+from marl_pack.game.moves import Floor, Moves
+from marl_pack.game.spec import GameSpec, document
+from marl_pack.game.state import GameState
+from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
+from marl_pack.items.items import ALL_ORIENTATIONS
+from marl_pack.plan import Plan
+from marl_pack.stability import OrientedItem, orient_item
 
 MOST_SKIPPED = 1000
-"""Episodes in a row whose first item has no place, before the game gives up."""
+"""Episodes in a row whose first item has no legal place, before the game gives up."""
 
-BIN_FIELDS = tuple(field.name for field in fields(state.Bins) if field.name != "height")
-GAME_FIELDS = ("items", "weights", "episode", "t", "stream_state", "lost")
+_turns = itertools.count()
 
 
 @dataclass(frozen=True)
 class Oriented:
-    """What the placement turn sees once an orientation is chosen."""
+    """What the placement turn is shown once an orientation is chosen."""
 
-    sides: Tensor  # int16 [N, 3]    the item's sides along x, y, z
-    mask: Tensor  # bool [N, W, D]   the cells where it may be set down
+    sides: Tensor  # int16 [G, 3]    the item's sides along x, y, z
+    mask: Tensor  # bool [G, W, D]   the cells where it may be placed
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What placing an item brought."""
+    """The result of placing an item in each game."""
 
-    reward: Tensor  # float32 [N]   Eq. 5
-    done: Tensor  # bool [N]        whether the episode ended with this placement
-    filled: Tensor  # int64 [N]     cells filled in the bin right after it, before any reset
-    placed: Tensor  # int64 [N]     boxes in the bin right after it
+    reward: Tensor  # float32 [G]   Eq. 5
+    done: Tensor  # bool [G]        whether the episode ended with this placement
+    filled: Tensor  # int64 [G]     cells filled in the bin right after it, before any reset
+    placed: Tensor  # int64 [G]     boxes in the bin right after it
     volume: int  # of a bin, in cells
 
     @property
     def utilization(self) -> Tensor:
-        """Share of each bin's volume filled right after the placement, float64 [N]."""
+        """Share of each bin's volume filled right after the placement, float64 [G]."""
         return self.filled.double() / self.volume
 
 
-def orientations_with_a_cell(mask: Tensor) -> Tensor:
-    """Bool [N, 6] of a mask [N, 6, W, D] (a sum is many times faster than ``any`` on the CPU)."""
-    return mask.sum((2, 3), dtype=torch.int32) > 0
-
-
+@document(" " * 8)
 class Packing:
-    """N bins, each with its own conveyor.
+    """G games, each with one bin and its own conveyor.
 
     An episode whose first item has no legal cell in the empty bin is over before it begins: it is
-    skipped with ``auto_reset``, and leaves its bin finished without.
+    skipped with ``auto_reset``, and leaves its game ended without.
 
     Attributes:
-        bins: what stands where (:class:`marl_pack.bins.Bins`).
-        items: int16 [N, 3], the visible item's own sides w, d, h.
-        weights: float64 [N], its weight.
-        mask: bool [N, 6, W, D], where it may be set down in each orientation.
-        orientation_mask: bool [N, 6], the orientations that may be chosen: those with a legal cell.
-        alive: bool [N], false where an episode has ended (only without ``auto_reset``).
-        episode, t: int64 [N], number of the episode played in each bin and items placed in it.
-        bin_height: int16 [N, 1], H.
+        spec: the options of the game.
+        state: all that the rest of the games depends on (:class:`marl_pack.game.state.GameState`).
+        bins, items, t, episode: parts of the state.
+        moves: the legal placements (:class:`marl_pack.game.moves.Moves`).
+        mask: bool [G, 6, W, D], where the item may be placed in each orientation.
+        orientation_mask: bool [G, 6], the orientations that may be chosen: those with a legal cell.
+        alive: bool [G], false where an episode has ended (only without ``auto_reset``).
+        turn: a number that no other turn of this or another game has; it changes with the masks.
+        orientation_sets: which orientations items may take in this game, with the share of items
+            that may take exactly those.
+        n, size, volume, floor: G, (W, D, H), W · D · H, and the numbers of cells and pairs.
+        bin_height: int16 [G, 1], H.
 
     Args:
-        n: number of bins N.
-        size: (W, D, H) in cells.
-        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array or a stream
+        n: number of games G.
+        bin: size (W, D, H) in cells; an option of the game, as below.
+        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array, items or a stream
             (:func:`marl_pack.items.make_stream`).
+        spec: options of the game; by default the usual ones.
         sides: shortest and longest side of generated items.
-        rule: name of a stability rule, or a rule from :func:`marl_pack.stability.make_rule`.
-        rule_parameters: what to bind to a named rule, e.g. ``{"margin": 1.0}``.
-        orientations: indices into :data:`marl_pack.bins.ORIENTATIONS` that may be chosen.
-        alpha: weight of the volume gained, Eq. 5.
-        beta: weight of the space wasted, Eq. 5.
-        com_offset: the items' centre of mass from their geometric centre, in fractions of w, d, h.
-        mask_orientations: whether orientations without a legal cell are excluded (the paper's
-            way). Else all allowed ones may be chosen, and a choice without a cell ends the episode
-            with nothing placed and no reward.
-        auto_reset: begin a new episode in a bin as soon as one ends there. Without it a finished
-            bin stays as it is, its mask stays empty and what is played there is ignored.
-        device: where everything happens.
+        auto_reset: begin a new episode in a game as soon as one ends there. Without it a game that
+            has ended stays as it is, its mask stays empty and what is played there is ignored.
+        device: where all tensors live.
+        backend: compiled loops or tensor code; by default the faster one on the device.
         seed: of the item streams.
-        first_episode: bin i plays the episodes ``first_episode + i``, then every N-th after it.
+        first_episode: game g plays the episodes ``first_episode + g``, then every G-th after it.
+        **options: options of the game, changed from ``spec``:
+        {options}
 
     Raises:
-        ValueError: if an argument cannot be, naming what would be right.
+        ValueError, TypeError: if an argument cannot be, naming what would be right.
     """
 
     def __init__(
         self,
         n: int,
-        size: tuple[int, int, int] = (10, 10, 10),
-        items: str | Path | ArrayLike | Stream = "rs",
+        bin: tuple[int, int, int] | None = None,  # the option's name
+        items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream = "rs",
         *,
+        spec: GameSpec | None = None,
         sides: tuple[int, int] = DEFAULT_SIDES,
-        rule: str | Rule = "hull_alpha",
-        rule_parameters: Mapping[str, Any] | None = None,
-        orientations: Sequence[int] = ALL_ORIENTATIONS,
-        alpha: float = 1.0,
-        beta: float = 1.0,
-        com_offset: tuple[float, float, float] = NO_OFFSET,
-        mask_orientations: bool = True,
         auto_reset: bool = True,
         device: torch.device | str = "cpu",
+        backend: Backend | None = None,
         seed: int = 0,
         first_episode: int = 0,
+        **options: Any,
     ) -> None:
         if n < 1:
-            raise ValueError(f"n = {n}: needs at least one bin")
-        chosen = sorted({int(o) for o in orientations})
-        if not chosen or not set(chosen) <= set(ALL_ORIENTATIONS):
-            raise ValueError(f"orientations {orientations!r}: need one or more of 0 … 5")
-        self.n = n
-        self.size = check_size(size)
+            raise ValueError(f"n = {n}: needs at least one game")
+        options |= {} if bin is None else {"bin": bin}
+        self.spec = (spec or GameSpec()).with_options(options)
+        self.n, self.auto_reset = n, auto_reset
         self.device = check_device(device)
-        self.stream = make_stream(items, self.size, sides).to(self.device)
-        if isinstance(rule, str):
-            rule = make_rule(rule, **(rule_parameters or {}))
-        elif rule_parameters:
-            raise ValueError("rule_parameters go with the name of a rule, not with a bound one")
-        self.rule = rule
-        self.orientations = tuple(chosen)
-        self.alpha, self.beta = float(alpha), float(beta)
-        if not (math.isfinite(self.alpha) and math.isfinite(self.beta)):
-            raise ValueError(f"alpha = {alpha}, beta = {beta}: need finite numbers")
-        self.com_offset = check_com_offset(com_offset)
-        self.mask_orientations, self.auto_reset = mask_orientations, auto_reset
-        self._index = torch.arange(n, device=self.device)
-        self._allowed = torch.tensor(
-            [o in chosen for o in ALL_ORIENTATIONS], device=self.device
-        )  # [6]
-        self._banned = [o for o in ALL_ORIENTATIONS if o not in chosen]
+        self.backend = backend or default_backend(self.device)
+        self.size = self.spec.bin
         width, depth, height = self.size
-        self.volume = width * depth * height
+        self.floor, self.volume = Floor(width, depth), width * depth * height
+        self.rule = self.spec.make_rule()
+        self.stream = make_stream(items, self.size, sides).to(self.device, self.backend)
+        self.orientation_sets = _orientation_sets(self.stream, self.spec)
+        self._games = torch.arange(n, device=self.device)
+        self._barred = [o for o in ALL_ORIENTATIONS if o not in self.spec.orientations]
+        self._allowed = torch.tensor(
+            [o not in self._barred for o in ALL_ORIENTATIONS], device=self.device
+        )  # [6]
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
-        self._gain, self._loss = self.alpha / self.volume, self.beta / self.volume
-        most = self.volume // self.stream.smallest
-        if self.stream.longest is not None:
-            most = min(most, self.stream.longest)
-        self.bins = state.empty(n, self.size, max_boxes=most, device=self.device)
-        self._empty = state.empty(n, self.size, max_boxes=0, device=self.device)
-        self._left: Afterstates | None = None
-        self._known: dict[Hashable, Tensor] = {}
+        self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
+        self.seed = seed
+        most = self._most_items(self.stream.smallest, self.stream.longest)
+        where = self.device, self.backend
+        self._bins = bin_state.empty(n, self.size, most, *where)
+        self._empty = bin_state.empty(n, self.size, 0, *where)
         self.reset(seed, first_episode)
 
+    def _most_items(self, smallest: int, longest: int | None) -> int:
+        """Return the most boxes that a bin can ever hold.
+
+        Args:
+            smallest: volume of the smallest item.
+            longest: items of the longest sequence, if sequences end.
+        """
+        limits = (self.volume // smallest, longest, self.spec.max_items)
+        return min(limit for limit in limits if limit is not None)
+
+    # --- the state --------------------------------------------------------------------------------
+
+    @property
+    def bins(self) -> Bins:
+        """The bins and the boxes in them."""
+        return self.state.bins
+
+    @property
+    def items(self) -> Items:
+        """The visible item of each game, [G]."""
+        return self.state.items
+
+    @property
+    def t(self) -> Tensor:
+        """Items that each episode has had before the visible one, int64 [G]."""
+        return self.state.t
+
+    @property
+    def episode(self) -> Tensor:
+        """Number of the episode that each game plays, int64 [G]."""
+        return self.state.episode
+
+    @property
+    def mask(self) -> Tensor:
+        """Where the item may be placed in each orientation, bool [G, 6, W, D]."""
+        return self.moves.mask
+
     def reset(self, seed: int | None = None, first_episode: int = 0) -> None:
-        """Empty all bins and begin the episodes ``first_episode + i``.
+        """Empty all bins and begin the episodes ``first_episode + g``.
 
         Raises:
             ValueError: with ``auto_reset``, if no episode has a legal first item.
         """
         if seed is not None:
             self.seed = int(seed)
-        self.episode = self._index + first_episode
-        self.t = torch.zeros_like(self.episode)
-        self.lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
-        state.clear(self.bins, slice(None))
-        self.stream_state = self.stream.start(self.seed, self.episode)
-        self.items, self.weights = self.stream.item(self.stream_state, self.t)
-        self._look()
+        bin_state.clear(self._bins, slice(None))
+        episode = self._games + first_episode
+        t = torch.zeros_like(episode)
+        stream = self.stream.start(self.seed, episode)
+        lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
+        self.set_state(GameState(self._bins, self.stream.item(stream, t), episode, t, lost, stream))
         if self.auto_reset:
-            self._begin((~self.alive).nonzero().squeeze(1))
+            self._restart(~self.alive)
 
-    def left(self) -> Afterstates:
-        """What each legal placement of the visible items would leave; made once a turn.
+    def set_state(self, state: GameState) -> None:
+        """Put the games into a state, such as one that :meth:`GameState.select` gave."""
+        self.state = state
+        self._find_moves()
 
-        For boxes with sides between the stream's shortest and longest.
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of all tensors that the rest of the games depends on."""
+        tensors = {name: tensor.clone() for name, tensor in self.state.tensors().items()}
+        return tensors | {"items_fingerprint": torch.tensor(fingerprint(self.stream))}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a :meth:`state_dict` of games made with the same arguments.
+
+        Raises:
+            ValueError: if it is of other games.
         """
-        if self._left is None:
-            sides = self.orient_item(self.items, self.weights).sides
-            lengths = probe_lengths(*self.stream.sides)
-            self._left = afterstates_of(self.bins, sides, self.mask, lengths)
-        return self._left
+        own = torch.tensor(fingerprint(self.stream))
+        if not torch.equal(tensors.get("items_fingerprint", ~own).cpu(), own):
+            raise ValueError(
+                "state of another game: its items are not this game's; a changed file?"
+            )
+        self.state.load(tensors)
+        self._find_moves()
 
-    def room(self) -> tuple[Tensor, Tensor]:
-        """Room after each legal placement, float32 [N, 6, W, D] each; 0 where none is legal.
+    def branch(
+        self,
+        games: Tensor,
+        stream: Stream | None = None,
+        seed: int = 0,
+        episodes: Tensor | None = None,
+    ) -> Packing:
+        """Return games that begin as copies of some of these, and then go on by themselves.
 
-        In how many cells a box that may come could be set down in the mean, and how probable it is
-        that the next item finds a place.
+        They do not restart when they end.
+
+        Args:
+            games: int64 [K], the games to copy; one may come several times.
+            stream: what comes after the visible items; as here, unless given.
+            seed, episodes: int64 [K], the episodes of ``stream`` that come.
         """
-        return (
-            self.once("room", lambda: self.left().spread(self.left().room(), self.mask)),
-            self.once("fits", lambda: self.left().spread(self.left().chance(self.orientations),
-                                                         self.mask)),
-        )  # fmt: skip
+        branched = copy.copy(self)
+        branched.n, branched.auto_reset = len(games), False
+        branched._games = torch.arange(len(games), device=self.device)
+        branched.bin_height = self.bin_height[games]
+        branched.state = self.state.select(games)
+        if stream is not None:
+            assert episodes is not None, "episodes go with a stream"
+            branched.stream, branched.seed = stream, seed
+            branched.orientation_sets = _orientation_sets(stream, self.spec)
+            most = self._most_items(min(self.stream.smallest, stream.smallest), None)
+            branched.state.bins = branched.bins.for_boxes(most)
+            branched.state.episode = episodes
+            branched.state.stream = stream.start(seed, episodes)
+        branched.turn = next(_turns)
+        branched.moves = Moves(self.mask[games])
+        branched.orientation_mask, branched.alive = self.orientation_mask[games], self.alive[games]
+        return branched
 
-    def once(self, what: Hashable, make: Callable[[], Tensor]) -> Tensor:
-        """What ``make`` gives [N, …], made once a turn; branches get their bins' part of it."""
-        if what not in self._known:
-            self._known[what] = make()
-        return self._known[what]
+    def plans(self) -> list[Plan]:
+        """Return what stands in each bin, a plan for each game."""
+        bins, names = self.bins.to("cpu"), self.stream.id_names
+        return [Plan.from_bins(bins, g, id_names=names) for g in range(self.n)]
 
-    def forget(self, what: Hashable) -> None:
-        """Make it anew when it is next asked for: see :meth:`once`."""
-        self._known.pop(what, None)
+    # --- a turn -----------------------------------------------------------------------------------
 
-    def masks(self, bins: state.Bins, items: Tensor, weights: Tensor) -> Tensor:
-        """Bool [N, 6, W, D]: where ``items`` [N, 3] may be set down in ``bins``, each way."""
-        return self.rule(bins, self.orient_item(items, weights))
-
-    def orient_item(self, items: Tensor, weights: Tensor) -> OrientedItem:
-        """The items in their six orientations; those that may not be chosen have zero sides."""
-        turned = orient_item(items, weights, self.com_offset)
-        if self._banned:
-            turned.sides[:, self._banned] = 0
-        return turned
+    def orient_item(self, items: Items) -> OrientedItem:
+        """Return items in their six orientations; those that may not be chosen get zero sides."""
+        oriented = orient_item(items.sides, items.weights, self.spec.com_offset)
+        if self._barred:
+            oriented.sides[:, self._barred] = 0
+        if items.orientations is not None:
+            oriented.sides.masked_fill_(~items.orientations[..., None], 0)
+        return oriented
 
     def orient(self, orientation: Tensor) -> Oriented:
-        """First turn: what would be seen with each item turned so. Changes nothing.
+        """First turn: return what each item shows in an orientation. Changes nothing.
 
         Args:
-            orientation: int64 [N], indices into :data:`marl_pack.bins.ORIENTATIONS`.
+            orientation: int64 [G], indices into :data:`marl_pack.bins.ORIENTATIONS`.
         """
-        return Oriented(self._turned(orientation), self.mask[self._index, orientation])
+        return Oriented(self._sides(orientation), self.moves.of(orientation))
 
-    def _turned(self, orientation: Tensor) -> Tensor:
-        """The items' sides along x, y, z, int16 [N, 3]."""
-        return self.items.gather(1, state.orientation_table(self.device)[orientation])
+    def _sides(self, orientation: Tensor) -> Tensor:
+        """Return the items' sides along x, y, z, int16 [G, 3]."""
+        return self.items.sides.gather(1, orientation_table(self.device)[orientation])
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
-        """Second turn: set each item down, and bring the next one.
+        """Second turn: place each item, and bring the next one.
 
         Args:
-            orientation: int64 [N], as in :meth:`orient`.
-            cell: int64 [N], low corners ``x · D + y``.
+            orientation: int64 [G], as in :meth:`orient`.
+            cell: int64 [G], low corners (:class:`marl_pack.game.moves.Floor`).
             check: whether to look if the choices are legal. Only a caller that has taken them from
                 the mask may do without: an illegal one would spoil the stack.
 
         Raises:
             ValueError: if a choice is not legal; nothing has changed then.
         """
-        alive = self.alive
+        state, alive = self.state, self.alive
         if orientation.shape != (self.n,) or cell.shape != (self.n,):
             raise ValueError(
                 f"orientation {list(orientation.shape)} and cell {list(cell.shape)}: need one "
-                f"whole number for each of {self.n} bins"
+                f"whole number for each of {self.n} games"
             )
         if check:
             self._check(orientation, cell)
-        sides = self._turned(orientation)
-        if not self.mask_orientations:
-            possible = orientations_with_a_cell(self.mask)[self._index, orientation]
-            self.lost = self.lost | (alive & ~possible)
-        if not (self.auto_reset and self.mask_orientations):
-            sides = torch.where((alive & ~self.lost)[:, None], sides, 0)
+        sides = self._sides(orientation)
+        if not self.spec.mask_orientations:
+            possible = Moves.gather(self.moves.orientations, orientation)
+            state.lost = state.lost | (alive & ~possible)
+        if not (self.auto_reset and self.spec.mask_orientations):
+            sides = torch.where((alive & ~state.lost)[:, None], sides, 0)
         com = None
-        if any(self.com_offset):
-            com = self.orient_item(self.items, self.weights).centres()[self._index, orientation]
-        _, waste, volume = state.place(self.bins, sides, cell, self.weights, com)
+        if any(self.spec.com_offset):
+            com = Moves.gather(self.orient_item(self.items).centres(), orientation)
+        corners = self.floor.corners(cell, self.backend)
+        labels = self.items.ids_at(state.t), orientation
+        _, waste, volume = bin_state.place(
+            state.bins, sides, corners, self.items.weights, com, labels
+        )
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * volume).sub_(waste, alpha=self._loss).float()
-        filled, placed = self.bins.filled.clone(), self.bins.count.clone()
+        filled, placed = state.bins.filled.clone(), state.bins.count.clone()
 
-        # A finished bin keeps the item that found no place, and so its empty mask.
-        self.t = self.t + (alive & ~self.lost)
-        self.items, self.weights = self.stream.item(self.stream_state, self.t)
-        self._look()
+        # A game that has ended keeps the item that had no place, and so its empty mask.
+        state.t = state.t + (alive & ~state.lost)
+        state.items = self.stream.item(state.stream, state.t)
+        self._find_moves()
         done = alive & ~self.alive
         if self.auto_reset:
-            self._begin(done.nonzero().squeeze(1))
+            self._restart(done)
         return Outcome(reward, done, filled, placed, self.volume)
 
-    def branch(
-        self,
-        which: Tensor,
-        stream: Stream | None = None,
-        seed: int = 0,
-        episodes: Tensor | None = None,
-    ) -> Packing:
-        """A game of its own that begins with copies of some of these bins, as they are now.
-
-        Its bins are not begun anew when they end.
-
-        Args:
-            which: int64 [K], bins to copy; one may come several times.
-            stream: what comes after the visible items; as here, unless given.
-            seed, episodes: int64 [K], the episodes of ``stream`` that come.
-        """
-        game = copy.copy(self)
-        game.n, game.auto_reset = len(which), False
-        game._index = torch.arange(len(which), device=self.device)
-        game.bins, game.bin_height = self.bins[which], self.bin_height[which]
-        game._left = None if self._left is None else self._left.of(which)
-        game._known = {what: made[which] for what, made in self._known.items()}
-        for name in ("items", "weights", "mask", "orientation_mask", "alive", "lost", "t"):
-            setattr(game, name, getattr(self, name)[which])
-        if stream is None:
-            game.episode, game.stream_state = self.episode[which], self.stream_state[which]
-        else:
-            assert episodes is not None
-            game.stream, game.seed, game.episode = stream, seed, episodes
-            smallest = min(self.stream.smallest, stream.smallest)
-            game.bins = game.bins.for_boxes(self.volume // smallest)
-            game.stream_state = stream.start(seed, episodes)
-        return game
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Everything that the rest of the game depends on, to be kept and loaded again."""
-        tensors = dict(zip(BIN_FIELDS, self.bins.tensors(), strict=True))
-        tensors |= {name: getattr(self, name) for name in GAME_FIELDS}
-        tensors["stream"] = torch.tensor(fingerprint(self.stream))
-        return {name: tensor.clone() for name, tensor in tensors.items()}
-
-    def load_state_dict(self, kept: Mapping[str, Tensor]) -> None:
-        """Go on from where :meth:`state_dict` was taken of a game made with the same arguments.
-
-        Raises:
-            ValueError: if it is another game's.
-        """
-        own = self.state_dict()
-        for name, tensor in own.items():
-            if name not in kept or kept[name].shape != tensor.shape:
-                found = list(kept[name].shape) if name in kept else "missing"
-                raise ValueError(
-                    f"state of another game: {name} is {found}, needs {list(tensor.shape)}"
-                )
-        if kept["stream"].cpu() != own["stream"]:
-            raise ValueError(
-                "state of another game: its items are not this game's; a changed file?"
-            )
-        for name, tensor in zip(BIN_FIELDS, self.bins.tensors(), strict=True):
-            tensor.copy_(kept[name])
-        for name in GAME_FIELDS:
-            setattr(self, name, kept[name].to(own[name]).clone())
-        self._look()
-
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
-        """Raise ValueError if a choice in a living bin is not legal."""
-        cells = self.size[0] * self.size[1]
-        real = (orientation >= 0) & (orientation < len(ORIENTATIONS)) & (cell >= 0) & (cell < cells)
-        turned, spot = torch.where(real, orientation, 0), torch.where(real, cell, 0)
-        legal = self.mask.flatten(2)[self._index, turned, spot]
-        if not self.mask_orientations:
-            legal |= self.orientation_mask[self._index, turned] & ~self.mask[
-                self._index, turned
-            ].flatten(1).any(1)
-        wrong = self.alive & ~(real & legal)
+        """Raise ValueError if a choice in a game that goes on is not legal."""
+        legal = self.moves.allows(orientation, cell)
+        if not self.spec.mask_orientations:  # an orientation without a cell may be chosen
+            real = (orientation >= 0) & (orientation < len(ALL_ORIENTATIONS))
+            real &= (cell >= 0) & (cell < self.floor.cells)
+            chosen = orientation * real
+            none = ~Moves.gather(self.moves.orientations, chosen)
+            legal |= real & none & Moves.gather(self.orientation_mask, chosen)
+        wrong = self.alive & ~legal
         if bool(wrong.any()):
-            i = int(wrong.nonzero()[0])
-            x, y = divmod(int(cell[i]), self.size[1])
+            g = int(wrong.nonzero()[0])
+            x, y = self.floor.corner(int(cell[g]))
             raise ValueError(
-                f"bin {i}: item {self.items[i].tolist()} in orientation {int(orientation[i])} may "
-                f"not be set down at ({x}, {y}), cell {int(cell[i])}; choose where the mask is true"
+                f"game {g}: item {self.items.sides[g].tolist()} in orientation "
+                f"{int(orientation[g])} may not be placed at ({x}, {y}), cell {int(cell[g])}; "
+                "choose where the mask is true"
             )
 
-    def _look(self) -> None:
-        """Make the masks of the items that have come; a bin where none is legal has ended."""
-        self._left, self._known = None, {}
-        self.mask = self.masks(self.bins, self.items, self.weights)
-        if not self.mask_orientations:
-            self.mask &= ~self.lost[:, None, None, None]
-        self.orientation_mask, self.alive = self._choices(self.mask)
+    # --- masks and episodes -----------------------------------------------------------------------
 
-    def _choices(self, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """The orientations that may be chosen [K, 6], and whether the episode goes on [K]."""
-        possible = orientations_with_a_cell(mask)
+    def _find_moves(self) -> None:
+        """Make the masks of the visible items; a game where none is legal has ended."""
+        state = self.state
+        mask = self.rule(state.bins, self.orient_item(state.items))
+        if not self.spec.mask_orientations:
+            mask &= ~state.lost[:, None, None, None]
+        if self.spec.max_items is not None:
+            mask &= (state.bins.count < self.spec.max_items)[:, None, None, None]
+        self.turn = next(_turns)
+        self.moves = Moves(mask)
+        self.orientation_mask, self.alive = self._choices(self.moves)
+
+    def _choices(self, moves: Moves) -> tuple[Tensor, Tensor]:
+        """Return the orientations that may be chosen, and whether the episode goes on."""
+        possible = moves.orientations
         alive = possible.any(1)
-        if not self.mask_orientations:
+        if not self.spec.mask_orientations:
             possible = self._allowed & alive[:, None]
         return possible, alive
 
-    def _begin(self, which: Tensor) -> None:
-        """Begin the next episode in the bins ``which`` (int64 [K]) that has a legal first item.
+    def _restart(self, ended: Tensor) -> None:
+        """Begin the next episode with a legal first item in the games that have ended, bool [G].
 
         Raises:
             ValueError: if there is none within :data:`MOST_SKIPPED` episodes.
         """
+        begin = self.backend.pick(compiled=self._begin_some, tensor=self._begin_by_mask)
         for _ in range(MOST_SKIPPED):
-            if not len(which):
+            if not bool(ended.any()):
                 return
-            self.episode[which] += self.n
-            self.t[which] = 0
-            self.lost[which] = False
-            state.clear(self.bins, which)
-            self.stream_state[which] = self.stream.start(self.seed, self.episode[which])
-            items, weights = self.stream.item(self.stream_state[which], self.t[which])
-            mask = self.masks(self._empty[: len(which)], items, weights)
-            self.items[which], self.weights[which], self.mask[which] = items, weights, mask
-            self.orientation_mask[which], self.alive[which] = self._choices(mask)
-            which = which[~self.alive[which]]
-        if len(which):
-            raise ValueError(
-                f"no item that begins an episode, such as {self.items[which[0]].tolist()}, may be "
-                f"set down anywhere in the empty bin {self.size}: check the orientations allowed "
-                f"{self.orientations}, the rule's margin and com_offset"
-            )
+            begin(ended)
+            ended = ended & ~self.alive
+        first = self.items.sides[int(ended.nonzero()[0])].tolist()
+        raise ValueError(
+            f"no item that begins an episode, such as {first}, may be placed anywhere in the empty "
+            f"bin {self.size}: check the orientations allowed {self.spec.orientations}, the rule's "
+            "margin and com_offset"
+        )
+
+    def _begin_some(self, ended: Tensor) -> None:
+        """Begin the next episode where ``ended``, computing nothing for the other games."""
+        state = self.state
+        games = ended.nonzero().squeeze(1)
+        state.episode[games] += self.n
+        state.t[games] = 0
+        state.lost[games] = False
+        bin_state.clear(state.bins, games)
+        state.stream[games] = self.stream.start(self.seed, state.episode[games])
+        items = self.stream.item(state.stream[games], state.t[games])
+        mask = self.rule(self._empty[: len(games)], self.orient_item(items))
+        for own, new in zip(state.items.tensors().values(), items.tensors().values(), strict=True):
+            own[games] = new
+        self.mask[games] = mask
+        self.orientation_mask[games], self.alive[games] = self._choices(Moves(mask))
+
+    def _begin_by_mask(self, ended: Tensor) -> None:
+        """Begin the next episode where ``ended``: every shape is fixed, so a device never waits."""
+        state = self.state
+        state.episode = torch.where(ended, state.episode + self.n, state.episode)
+        state.t = state.t.masked_fill(ended, 0)
+        state.lost = state.lost & ~ended
+        bin_state.clear(state.bins, ended)
+        state.stream = self.stream.restart(state.stream, self.seed, state.episode, ended)
+        state.items = self.stream.item(state.stream, state.t)
+        mask = self.rule(self._empty, self.orient_item(state.items))
+        self.moves = Moves(torch.where(ended[:, None, None, None], mask, self.mask))
+        self.orientation_mask, self.alive = self._choices(self.moves)
+
+
+def _orientation_sets(stream: Stream, spec: GameSpec) -> dict[tuple[int, ...], float]:
+    """Return the sets of orientations that a stream's items may take under the spec."""
+    shares: dict[tuple[int, ...], float] = {}
+    for orientations, share in stream.orientation_sets.items():
+        allowed = tuple(o for o in orientations if o in spec.orientations)
+        shares[allowed] = shares.get(allowed, 0.0) + share
+    return shares

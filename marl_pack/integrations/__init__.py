@@ -1,6 +1,8 @@
-"""What other people's trainers need to train on the environment; ``examples/`` shows how.
+"""What other people's trainers need to train on the environment; ``examples/`` shows its use.
 
 - :mod:`marl_pack.integrations.network`: a small masked actor-critic in plain PyTorch;
-- :mod:`marl_pack.integrations.session`: the command line of the examples, and the account of what
-  a trainer did with the environment.
+- one module for each trainer that wraps it as the trainer wants it: :mod:`agilerl <.agilerl>`,
+  :mod:`benchmarl <.benchmarl>`, :mod:`rllib <.rllib>`, :mod:`sb3 <.sb3>`, :mod:`skrl <.skrl>`,
+  :mod:`tianshou <.tianshou>`, :mod:`torchrl <.torchrl>`. Each imports its trainer, which has to be
+  installed; nothing else does.
 """

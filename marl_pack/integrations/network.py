@@ -1,7 +1,7 @@
-"""A small actor-critic for the PettingZoo environment, in plain PyTorch.
+"""A small masked actor-critic for the PettingZoo environment, in plain PyTorch.
 
-It sees what the environment shows (:mod:`marl_pack.env_aec`) and works for any bin size. The
-agents of ``marl_pack.train`` see more and are larger; this one is to be copied and changed.
+It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. The agents of
+``marl_pack.train`` observe more and are larger; this one is to be copied and changed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ FORBIDDEN = -1e9
 
 
 class ActorCritic(nn.Module):
-    """Planes of one agent's turn, and its mask → logits of its actions, and the state's value.
+    """A network that turns one agent's planes and mask into logits and the state's value.
 
     Args:
         agent: ``"orientation"`` scores six orientations, ``"placement"`` every cell;
@@ -33,7 +33,7 @@ class ActorCritic(nn.Module):
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
         )  # fmt: skip
-        self.turns = nn.Linear(2 * channels, 6)
+        self.orientations = nn.Linear(2 * channels, 6)
         self.cells = nn.Conv2d(channels, 1, 1)
         self.critic = nn.Sequential(
             nn.Linear(2 * channels, 64), nn.ReLU(), nn.Linear(64, 1)
@@ -41,11 +41,11 @@ class ActorCritic(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its weights are."""
+        """Device of its weights."""
         return self.cells.weight.device
 
     def forward(self, planes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Masked logits [B, n] and values [B].
+        """Return masked logits [B, n] and values [B].
 
         Args:
             planes: float [B, 4, W, D], or [B, 5, W, D] with ``pad_actions=True``.
@@ -53,19 +53,19 @@ class ActorCritic(nn.Module):
         """
         legal = mask.bool()
         batch, _, width, depth = planes.shape
-        if self.agent != "orientation":  # where the item may go is the best there is to see
-            spots = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
+        if self.agent != "orientation":  # where the item may go says most
+            cells = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
             if self.agent == "both":
-                spots = spots * planes[:, 4:]  # in the orientation's turn the mask has no cells
-            planes = torch.cat((planes, spots), 1)
+                cells = cells * planes[:, 4:]  # in the orientation's turn the mask has no cells
+            planes = torch.cat((planes, cells), 1)
         features = self.trunk(planes)
         pooled = torch.cat((features.mean((2, 3)), features.amax((2, 3))), 1)
         if self.agent == "orientation":
-            logits = self.turns(pooled)
+            logits = self.orientations(pooled)
         else:
             logits = self.cells(features).flatten(1)
             if self.agent == "both":
                 logits = nn.functional.pad(logits, (0, mask.shape[1] - width * depth))
-                turn = nn.functional.pad(self.turns(pooled), (0, mask.shape[1] - 6))
-                logits = torch.where(planes[:, 4, 0, 0, None] > 0, logits, turn)
+                orientations = nn.functional.pad(self.orientations(pooled), (0, mask.shape[1] - 6))
+                logits = torch.where(planes[:, 4, 0, 0, None] > 0, logits, orientations)
         return logits.masked_fill(~legal, FORBIDDEN), self.critic(pooled).squeeze(1)

@@ -1,4 +1,4 @@
-"""Cutting the bin itself into items (Zhao et al. 2021, sec. 5): a perfect packing is known."""
+"""Cut the bin itself into items (Zhao et al. 2021, sec. 5), so that a perfect packing is known."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
 
 @njit(cache=True)
 def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: Any) -> int:
-    """Cut the bin until every edge is in low … high; rows x, y, z, w, d, h. Returns how many.
+    """Cut the bin until every edge is in low … high, and return the number of pieces.
 
-    Pieces come in the order in which they are finished.
+    Rows of ``pieces`` are x, y, z, w, d, h, in the order in which the pieces are finished.
     """
     waiting[0, :3] = 0
     waiting[0, 3:] = size
@@ -44,7 +44,7 @@ def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: A
         left -= 1
         waiting[chosen] = waiting[left]
         edges = parts[0, 3:].copy()
-        cuts = 0  # an edge can be cut in two, each at least low, in so many places
+        cuts = 0  # places where an edge can be cut into two parts of at least low
         for axis in range(3):
             if edges[axis] > high:
                 cuts += edges[axis] - 2 * low + 1
@@ -69,7 +69,7 @@ def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: A
 
 @njit(cache=True)
 def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out: Any) -> None:
-    """CUT-2: draw uniformly among the pieces whose whole floor is built, until none is left."""
+    """Order the pieces by CUT-2: repeatedly draw one of those whose whole floor is built."""
     height = np.zeros(shape, np.int64)
     left = np.arange(n)
     ready = np.empty(n, np.int64)
@@ -89,6 +89,7 @@ def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out
 
 @njit(cache=True, nogil=True)
 def _cut_all(keys: Any, size: Any, low: int, high: int, order: int, out: Any) -> None:
+    """Cut the bin once for each key, into rows of ``out`` [K, L, 6] in the order of arrival."""
     most = out.shape[1]
     pieces, waiting = np.empty((most, 6), np.int64), np.empty((most, 6), np.int64)
     state = np.empty(1, np.uint64)
@@ -104,12 +105,12 @@ def _cut_all(keys: Any, size: Any, low: int, high: int, order: int, out: Any) ->
 def cut(
     size: Size, order: Literal[1, 2], seed: int, episodes: Tensor, sides: tuple[int, int]
 ) -> Tensor:
-    """Sequences made by cutting the bin, with their perfect solution.
+    """Cut the bin into sequences of items whose perfect packing is known.
 
     Start with the bin; while there are pieces with an edge longer than ``high``, choose one of them
     and one of its possible cuts, across such an edge at a position in [low, edge - low], both
     uniformly, and replace it by the two parts. With pieces in the order in which they are finished,
-    neighbours in a sequence are as often alike as in the published CUT-1.
+    neighbours in a sequence are equal as often as in the published CUT-1.
 
     Args:
         size: (W, D, H).

@@ -1,4 +1,4 @@
-"""Random numbers by counting: the same on every device, in every batch, in tensors and loops."""
+"""Counter-based random numbers, equal on every device, in every batch, in tensors and loops."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ GOLDEN, _MIX_1, _MIX_2 = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB13311
 
 
 def _signed(value: int) -> int:
-    """A 64-bit pattern as the signed integer that has it."""
+    """Return the signed integer with the 64-bit pattern of ``value``."""
     value &= (1 << 64) - 1
     return value - (1 << 64) if value >> 63 else value
 
 
 def _shift_right(x: Tensor, bits: int) -> Tensor:
-    """Logical right shift of int64."""
+    """Return int64 ``x`` shifted right by ``bits``, with zeros for the bits that come in."""
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def mix(key: Tensor, counter: Tensor | int) -> Tensor:
-    """64 random bits a (key, counter), int64: SplitMix64's output function (Steele et al. 2014)."""
+    """Return 64 random bits for each (key, counter), int64.
+
+    This is the output function of SplitMix64 (Steele et al. 2014).
+    """
     z = key + (torch.as_tensor(counter, device=key.device) + 1) * _signed(GOLDEN)
     z = (z ^ _shift_right(z, 30)) * _signed(_MIX_1)
     z = (z ^ _shift_right(z, 27)) * _signed(_MIX_2)
@@ -32,18 +35,21 @@ def mix(key: Tensor, counter: Tensor | int) -> Tensor:
 
 
 def below(bits: Tensor, limit: int) -> Tensor:
-    """Random bits turned into a whole number in 0 … limit - 1, uniform (bias under limit / 2³²)."""
+    """Return a uniform whole number in 0 … limit - 1 from random bits (bias below limit / 2³²)."""
     return _shift_right(_shift_right(bits, 32) * limit, 32)
 
 
 def episode_keys(seed: int, episodes: Tensor) -> Tensor:
-    """One independent key, int64 [K], for each episode of a seed."""
+    """Return one independent key, int64 [K], for each episode of a seed."""
     return mix(mix(torch.full_like(episodes, _signed(seed)), 0), episodes)
 
 
 @njit(cache=True)
 def draw(state: Any, limit: int) -> int:
-    """The next whole number in 0 … limit - 1 of the SplitMix64 generator ``state`` (uint64 [1])."""
+    """Return the next whole number in 0 … limit - 1 of the generator ``state``.
+
+    The generator is SplitMix64; ``state`` (uint64 [1]) is advanced in place.
+    """
     state[0] += np.uint64(GOLDEN)
     z = state[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(_MIX_1)

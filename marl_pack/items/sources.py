@@ -1,15 +1,18 @@
-"""The stream that a name, a file or an array stands for."""
+"""Return the stream that a name, a file, an array, a mapping or a record names."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from numpy.typing import ArrayLike
 
 from marl_pack.bins import Size, check_size
 from marl_pack.items.cutting import check_sides, cut
-from marl_pack.items.files import read_fields
+from marl_pack.items.files import check_fields, read_fields
+from marl_pack.items.items import Items
 from marl_pack.items.sequences import Sequences, check_items
 from marl_pack.items.streams import Cut, Stream, Uniform
 
@@ -19,16 +22,19 @@ GENERATED = ("rs", "cut1", "cut2")
 DEFAULT_SIDES = (2, 5)
 """Shortest and longest side of a generated item: the 64 types {2..5}³ of RS and CUT."""
 
+MEMBERS = tuple(name for name in vars(Stream) if not name.startswith("_"))
+"""What a stream has."""
+
 
 def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
     """Read item sequences from a file, by its ending.
 
-    - ``.npz``: ``items`` [S, L, 3] or [L, 3], with ``lengths`` [S], ``weights`` and ``bin`` [3] if
-      present.
+    - ``.npz``: ``items`` [S, L, 3] or [L, 3]; if wanted, attributes by key
+      (:data:`marl_pack.items.ATTRIBUTES`), ``lengths`` [S] and ``bin`` [3].
     - ``.json``: an object with the same keys, ``items`` also as sequences of unequal length; or
       just the items.
-    - ``.csv``: a header naming the columns w, d, h and, if wanted, weight (one weight a row) and
-      sequence (a number; rows of one sequence stand together); one item a row.
+    - ``.csv``: a header naming the columns w, d, h and, if wanted, attributes and sequence (a
+      number or text; rows of one sequence keep their order); one item a row.
 
     Args:
         path: the file.
@@ -39,71 +45,94 @@ def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: for another ending, a missing key or column, no bin size or another one than
-            the file's, or an item that cannot be, with its row.
+        ValueError: for another ending, a missing or unknown key or column, no bin size or another
+            one than the file's, or an item that is impossible, with its row.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; items are {', '.join(GENERATED)} or a file")
-    fields = read_fields(path)
-    told = fields.get("bin")
+    return _from_fields(read_fields(path), size, str(path))
+
+
+def _from_fields(
+    fields: Mapping[str, Any], size: Size | None, source: str
+) -> tuple[Sequences, Size]:
+    """Return the sequences that the fields of a file or a mapping give, and the bin size."""
+    own = fields.get("bin")
     try:
-        told = None if told is None else check_size(told)
+        own = None if own is None else check_size(own)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    bin_size = told if size is None else check_size(size)
+        raise ValueError(f"{source}: {error}") from None
+    bin_size = own if size is None else check_size(size)
     if bin_size is None:
-        raise ValueError(f"{path}: says no bin size; give one")
-    if told not in (None, bin_size):
-        raise ValueError(f"{path}: is for the bin {told}, not {bin_size}; give that size")
-    sequences = check_items(
-        fields["items"], bin_size, fields.get("weights"), fields.get("lengths"), str(path)
-    )
-    return sequences, bin_size
+        raise ValueError(f"{source}: names no bin size; give one")
+    if own not in (None, bin_size):
+        raise ValueError(f"{source}: is for the bin {own}, not {bin_size}; give that size")
+    attributes = {key: values for key, values in fields.items() if key not in ("items", "bin")}
+    return check_items(fields["items"], bin_size, source=source, **attributes), bin_size
 
 
 def make_stream(
-    items: str | Path | ArrayLike | Stream,
+    items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream,
     size: Size,
     sides: tuple[int, int] = DEFAULT_SIDES,
 ) -> Stream:
-    """The stream that ``items`` names.
+    """Return the stream that ``items`` names.
 
     Args:
-        items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file (:func:`load`), an array [L, 3] or
-            [S, L, 3], or a stream.
+        items: ``"rs"``, ``"cut1"``, ``"cut2"``; a file (:func:`load`); an array [L, 3] or
+            [S, L, 3]; items with attributes, as a record [L] or [S, L] or as a mapping with the
+            keys of a JSON file; or a stream.
         size: (W, D, H) of the bin.
         sides: shortest and longest side of generated items.
 
     Raises:
-        ValueError: if an item fits into the bin in no orientation, or the name is unknown.
+        ValueError: if an item fits into the bin in none of its orientations, the name is unknown,
+            or an object lacks a member of a stream.
     """
     size = check_size(size)
     if isinstance(items, str) and items in GENERATED:
-        low, high = check_sides(sides)
-        if items == "rs":
-            if high > min(size):
-                raise ValueError(
-                    f"items 'rs' with sides {low}..{high}: the largest fits into the bin {size} "
-                    f"in no orientation; the longest side can be {min(size)}"
-                )
-            return Uniform(low, high)
-        stream = Cut(size, 1 if items == "cut1" else 2, low, high)
-        cut(size, stream.order, 0, torch.zeros(1, dtype=torch.int64), (low, high))
-        return stream
+        return _generated(items, size, sides)
     if isinstance(items, str | Path):
         if isinstance(items, str) and not Path(items).suffix:
             raise ValueError(f"unknown items {items!r}: one of {', '.join(GENERATED)}, or a file")
         return load(items, size)[0]
-    if all(hasattr(items, name) for name in ("start", "item", "to", "smallest", "longest")):
-        return items  # type: ignore[return-value]  # a Stream, by its two functions
-    return check_items(items, size)  # type: ignore[arg-type]  # not a stream, so an array
+    if isinstance(items, Items):
+        attributes: dict[str, Any] = dict(items.to("cpu").tensors())
+        return check_items(attributes.pop("sides"), size, **attributes)
+    if isinstance(items, Mapping):
+        check_fields(items, "items")
+        return _from_fields(items, size, "items")[0]
+    if isinstance(items, list | tuple) or hasattr(items, "__array__"):
+        return check_items(cast(ArrayLike, items), size)
+    missing = [name for name in MEMBERS if not hasattr(items, name)]
+    if missing:
+        raise ValueError(
+            f"items {type(items).__name__}: neither an array nor a stream, which also needs "
+            f"{', '.join(missing)}"
+        )
+    return items  # type: ignore[return-value]  # it has the members of a Stream
+
+
+def _generated(name: str, size: Size, sides: tuple[int, int]) -> Stream:
+    """Return the stream of :data:`GENERATED`, refused if it cannot bring items for this bin."""
+    low, high = check_sides(sides)
+    if name == "rs":
+        if high > min(size):
+            raise ValueError(
+                f"items 'rs' with sides {low}..{high}: the largest fits into the bin {size} "
+                f"in no orientation; the longest side can be {min(size)}"
+            )
+        return Uniform(low, high)
+    stream = Cut(size, 1 if name == "cut1" else 2, low, high)
+    cut(size, stream.order, 0, torch.zeros(1, dtype=torch.int64), (low, high))
+    return stream
 
 
 def choose_stream(
     items: str, size: Size | None = None, sides: tuple[int, int] = DEFAULT_SIDES
 ) -> tuple[Stream, Size]:
-    """The stream and bin size that a command's options name.
+    """Return the stream and the bin size that a command's options name.
 
     Args:
         items: a name in :data:`GENERATED` or a file.

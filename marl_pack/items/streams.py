@@ -1,8 +1,9 @@
 """Item streams: what the conveyor brings, episode by episode.
 
-A stream is two pure functions. ``start(seed, episodes)`` returns the state of each episode, and
-``item(state, t)`` the item at step t of each. Episode k of seed s is the same sequence in every
-batch, on every device, whatever was played before. Weights are volumes unless a file gives them.
+A stream is three pure functions. ``start(seed, episodes)`` returns the state of each episode,
+``item(state, t)`` the item at step t of each, and ``restart`` the state after some have ended.
+Episode k of seed s is the same sequence in every batch and on every device. Weights are volumes
+unless they are given.
 
 Sources (Zhao et al. 2021, sec. 5): ``rs`` draws uniformly from all types; ``cut1`` and ``cut2`` cut
 the bin itself into items, so that a perfect packing is known (:mod:`marl_pack.items.cutting`).
@@ -11,7 +12,8 @@ the bin itself into items, so that a perfect packing is known (:mod:`marl_pack.i
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -19,28 +21,39 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from marl_pack import bins
+from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import Size
 from marl_pack.items.cutting import cut
+from marl_pack.items.items import ALL_ORIENTATIONS, Items, join
 from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mix
 
 
 class Stream(Protocol):
-    """Where items come from."""
+    """Source of items, one after the other, in numbered episodes."""
 
     @property
     def smallest(self) -> int:
-        """A lower bound on an item's volume in cells: it tells how many boxes a bin can hold."""
+        """A lower bound on an item's volume in cells; it bounds how many boxes a bin can hold."""
         ...
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Shortest and longest side that an item may have."""
+        """Shortest and longest side that an item may have, in cells."""
+        ...
+
+    @property
+    def orientation_sets(self) -> Mapping[tuple[int, ...], float]:
+        """Sets of orientations that items may take, with the share of items that have each."""
+        ...
+
+    @property
+    def id_names(self) -> tuple[str, ...] | None:
+        """The texts that the items' ids index; None if ids are numbers."""
         ...
 
     @property
     def episodes(self) -> int | None:
-        """How many different episodes there are; None if there is no end of them."""
+        """Number of different episodes; None if there is no end of them."""
         ...
 
     @property
@@ -49,24 +62,50 @@ class Stream(Protocol):
         ...
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
-        """State [K, …] at the start of the episodes numbered ``episodes`` (int64 [K])."""
+        """Return the state [K, …] at the start of the episodes ``episodes`` (int64 [K])."""
         ...
 
-    def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Sides int16 [N, 3] and weights float64 [N] at step ``t`` (int64 [N]); 0 at the end."""
+    def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
+        """Return the state [N, …] where some episodes begin and the others go on.
+
+        Args:
+            state: of the N episodes; it is not changed.
+            seed: of the episodes that begin.
+            episodes: int64 [N], the numbers of those that begin; elsewhere they have no effect.
+            ended: bool [N], where they begin.
+        """
         ...
 
-    def to(self, device: torch.device | str) -> Stream:
-        """The same stream with its tables on ``device``."""
+    def item(self, state: Tensor, t: Tensor) -> Items:
+        """Return the items [N] at step ``t`` (int64 [N]); zeros past the end.
+
+        Their ids are those given with the items, else ``t`` itself.
+        """
+        ...
+
+    def to(self, device: torch.device | str, backend: Backend | None = None) -> Stream:
+        """Return the same stream with its tables on ``device``.
+
+        Args:
+            device: where states and items are.
+            backend: the code that draws items; by default the faster one on ``device``.
+        """
         ...
 
 
 # --- RS -------------------------------------------------------------------------------------------
 
 
+def _uniform_compiled(keys: Tensor, t: Tensor, low: int, kinds: int) -> tuple[Tensor, Tensor]:
+    """Draw items by one compiled loop, which beats thirty tensor operations on the CPU."""
+    sides, weights = np.empty((len(keys), 3), np.int16), np.empty(len(keys))
+    _uniform_loop(keys.numpy(), t.numpy(), low, kinds, sides, weights)
+    return torch.from_numpy(sides), torch.from_numpy(weights)
+
+
 @njit(cache=True, nogil=True)
-def _uniform_items(keys: Any, t: Any, low: int, kinds: int, sides: Any, weights: Any) -> None:
-    """:meth:`Uniform.item` on the CPU, where a loop beats thirty tensor operations."""
+def _uniform_loop(keys: Any, t: Any, low: int, kinds: int, sides: Any, weights: Any) -> None:
+    """Write the sides [N, 3] and the weights [N] of the items drawn."""
     state = np.empty(1, np.uint64)
     for b in range(keys.size):
         state[0] = np.uint64(keys[b]) + np.uint64(t[b]) * np.uint64(GOLDEN)
@@ -74,6 +113,13 @@ def _uniform_items(keys: Any, t: Any, low: int, kinds: int, sides: Any, weights:
         w, d, h = low + kind // kinds**2, low + kind // kinds % kinds, low + kind % kinds
         sides[b, 0], sides[b, 1], sides[b, 2] = w, d, h
         weights[b] = float(w) * d * h
+
+
+def _uniform_tensor(keys: Tensor, t: Tensor, low: int, kinds: int) -> tuple[Tensor, Tensor]:
+    """Draw the same items by tensor operations, on any device."""
+    kind = below(mix(keys, t), kinds**3)
+    sides = torch.stack((kind // kinds**2, kind // kinds % kinds, kind % kinds), 1) + low
+    return sides.to(torch.int16), sides.double().prod(1)
 
 
 @dataclass(frozen=True)
@@ -84,35 +130,41 @@ class Uniform:
     high: int
     episodes: None = None
     longest: None = None
+    id_names: None = None
+    backend: Backend = field(default=Backend.COMPILED, compare=False)
 
     @property
     def smallest(self) -> int:
-        """Volume of the smallest type."""
+        """Volume of the smallest type, in cells."""
         return self.low**3
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Shortest and longest side."""
+        """Shortest and longest side, in cells."""
         return self.low, self.high
 
+    @property
+    def orientation_sets(self) -> dict[tuple[int, ...], float]:
+        """All six orientations, for every item."""
+        return {ALL_ORIENTATIONS: 1.0}
+
     def start(self, seed: int, episodes: Tensor) -> Tensor:
-        """The episodes' keys, int64 [K]."""
+        """Return the episodes' keys, int64 [K]."""
         return episode_keys(seed, episodes)
 
-    def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Sides int16 [N, 3] and weights float64 [N]."""
-        kinds = self.high - self.low + 1
-        if bins.compiled(state.device):
-            out = np.empty((len(state), 3), np.int16), np.empty(len(state))
-            _uniform_items(state.numpy(), t.numpy(), self.low, kinds, *out)
-            return torch.from_numpy(out[0]), torch.from_numpy(out[1])
-        kind = below(mix(state, t), kinds**3)
-        sides = torch.stack((kind // kinds**2, kind // kinds % kinds, kind % kinds), 1) + self.low
-        return sides.to(torch.int16), sides.double().prod(1)
+    def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
+        """Return the keys, new where episodes have ended."""
+        return torch.where(ended, self.start(seed, episodes), state)
 
-    def to(self, device: torch.device | str) -> Uniform:
-        """Itself: it has no tables."""
-        return self
+    def item(self, state: Tensor, t: Tensor) -> Items:
+        """Return the items [N] at step ``t``, drawn by counting from the episode's key."""
+        draw_items = self.backend.pick(compiled=_uniform_compiled, tensor=_uniform_tensor)
+        sides, weights = draw_items(state, t, self.low, self.high - self.low + 1)
+        return Items(sides, weights, ids=t)
+
+    def to(self, device: torch.device | str, backend: Backend | None = None) -> Uniform:
+        """Return the stream that draws by ``backend``; it has no tables."""
+        return replace(self, backend=backend or default_backend(device))
 
 
 # --- CUT-1 and CUT-2 ------------------------------------------------------------------------------
@@ -127,108 +179,144 @@ class Cut:
     low: int
     high: int
     episodes: None = None
+    id_names: None = None
 
     @property
     def smallest(self) -> int:
-        """Volume of the smallest possible piece."""
+        """Volume of the smallest possible piece, in cells."""
         return self.low**3
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Shortest and longest side of a piece."""
+        """Shortest and longest side of a piece, in cells."""
         return self.low, self.high
 
     @property
+    def orientation_sets(self) -> dict[tuple[int, ...], float]:
+        """All six orientations, for every piece."""
+        return {ALL_ORIENTATIONS: 1.0}
+
+    @property
     def longest(self) -> int:
-        """As many pieces as fit if all are the smallest."""
+        """Number of pieces if all are the smallest."""
         return int(np.prod([s // self.low for s in self.size]))
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
-        """The episodes' items, int16 [K, L, 3]."""
+        """Return the episodes' items, int16 [K, L, 3]."""
         boxes = cut(self.size, self.order, seed, episodes, (self.low, self.high))[..., 3:]
         items = torch.zeros(len(boxes), self.longest, 3, dtype=torch.int16)
         items[:, : boxes.shape[1]] = boxes
         return items.to(episodes.device)
 
-    def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Sides int16 [N, 3] and weights float64 [N]."""
-        sides = _row(state, t)
-        return sides, sides.double().prod(1)
+    def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
+        """Return the episodes' items, cut again where they have ended.
 
-    def to(self, device: torch.device | str) -> Cut:
-        """Itself: the cuts are made on the CPU and handed over episode by episode."""
+        Cutting is CPU code, so only the episodes that ended are cut, and the host waits for their
+        number.
+        """
+        index = ended.nonzero().squeeze(1)
+        return state.index_copy(0, index, self.start(seed, episodes[index]))
+
+    def item(self, state: Tensor, t: Tensor) -> Items:
+        """Return the pieces [N] at step ``t`` of each episode; zeros past the end."""
+        last = state.shape[1] - 1
+        sides = state[torch.arange(len(state), device=state.device), t.clamp(max=last)]
+        sides = sides * (t <= last)[:, None].to(sides.dtype)
+        return Items(sides, sides.double().prod(1), ids=t)
+
+    def to(self, device: torch.device | str, backend: Backend | None = None) -> Cut:
+        """Return the stream itself: bins are cut on the CPU, whatever the device and backend."""
         return self
 
 
-def fingerprint(stream: Stream) -> int:
-    """A number that differs between streams of different items, the same in every process."""
-    digest = hashlib.blake2b(type(stream).__name__.encode(), digest_size=7)
-    for value in getattr(stream, "__dict__", {}).values():
-        held = value.cpu().numpy().tobytes() if isinstance(value, Tensor) else repr(value).encode()
-        digest.update(held)
-    return int.from_bytes(digest.digest(), "little")
-
-
-def _row(table: Tensor, t: Tensor) -> Tensor:
-    """Row ``t`` [N] of each table [N, L, 3]; zeros past the end."""
-    last = table.shape[1] - 1
-    rows = table[torch.arange(len(table), device=table.device), t.clamp(max=last)]
-    return rows * (t <= last)[:, None].to(rows.dtype)
-
-
-# --- what may come --------------------------------------------------------------------------------
+# --- i.i.d. from a table --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Drawn:
     """Items drawn i.i.d. from the rows of a table, without end."""
 
-    items: Tensor  # int16 [R, 3]     sides
-    weights: Tensor  # float64 [R]
+    items: Items  # [R]
     episodes: None = None
     longest: None = None
+    id_names: tuple[str, ...] | None = None
 
     @property
     def smallest(self) -> int:
-        """Volume of the smallest item."""
-        return int(self.items.long().prod(1).min())
+        """Volume of the smallest item, in cells."""
+        return int(self.items.sides.long().prod(1).min())
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Shortest and longest side of any item."""
-        return int(self.items.min()), int(self.items.max())
+        """Shortest and longest side of any item, in cells."""
+        return int(self.items.sides.min()), int(self.items.sides.max())
+
+    @property
+    def orientation_sets(self) -> dict[tuple[int, ...], float]:
+        """Sets of orientations that items may take, with the share of items that have each."""
+        return self.items.orientation_sets()
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
-        """The episodes' keys, int64 [K]."""
+        """Return the episodes' keys, int64 [K]."""
         return episode_keys(seed, episodes)
 
-    def item(self, state: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Sides int16 [N, 3] and weights float64 [N]."""
-        row = below(mix(state, t), len(self.items))
-        return self.items[row], self.weights[row]
+    def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
+        """Return the keys, new where episodes have ended."""
+        return torch.where(ended, self.start(seed, episodes), state)
 
-    def to(self, device: torch.device | str) -> Drawn:
-        """The same table on ``device``."""
-        return Drawn(self.items.to(device), self.weights.to(device))
+    def item(self, state: Tensor, t: Tensor) -> Items:
+        """Return the items [N] at step ``t``, rows of the table drawn by counting."""
+        return self.items[below(mix(state, t), len(self.items.sides))].numbered(t)
+
+    def to(self, device: torch.device | str, backend: Backend | None = None) -> Drawn:
+        """Return the stream with its table on ``device``; every backend draws by tensor code."""
+        return replace(self, items=self.items.to(device))
+
+
+AT_ONCE = 1 << 20
+"""About as many numbers of states are copied at once when a stream's items are collected."""
 
 
 def independent(stream: Stream, sequences: int = 500) -> Stream:
-    """Items one by one as probable as in ``stream``, whatever came before them.
+    """Return a stream of items that are i.i.d., each as probable as in ``stream``.
 
     Args:
-        stream: RS, which is so itself; else the rows of its sequences are drawn from.
-        sequences: how many of them, where they have no end.
+        stream: RS or a table, which are i.i.d. themselves; else its sequences' items are drawn.
+        sequences: number of sequences to draw from, where the stream has no end of them.
+
+    Raises:
+        ValueError: if the stream's sequences have no end.
     """
-    if isinstance(stream, Uniform):
+    if isinstance(stream, Uniform | Drawn):
         return stream
+    if stream.longest is None:
+        raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
     count = stream.episodes or sequences
     state = stream.start(-1, torch.arange(count))  # episodes that are played have seeds from 0
-    rows = []
-    for t in range(stream.longest or 0):
-        sides, weights = stream.item(state, torch.full((count,), t))
-        held = (sides > 0).all(1)
-        rows.append((sides[held], weights[held]))
-    if not rows:
-        raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
-    boxes, masses = zip(*rows, strict=True)
-    return Drawn(torch.cat(boxes), torch.cat(masses))
+    parts = []
+    for steps in torch.split(torch.arange(stream.longest), max(1, AT_ONCE // state.numel())):
+        t = steps.repeat_interleave(count)
+        items = stream.item(state[torch.arange(count).repeat(len(steps))], t)
+        if items.ids is t:  # places in a sequence mean nothing outside it
+            items = replace(items, ids=None)
+        parts.append(items[items.present])
+    return Drawn(join(parts), id_names=stream.id_names)
+
+
+def fingerprint(stream: Stream) -> int:
+    """Return a number that differs between streams of different items.
+
+    It is the same in every process, on every device and for every backend.
+    """
+    digest = hashlib.blake2b(type(stream).__name__.encode(), digest_size=7)
+    for name, value in getattr(stream, "__dict__", {}).items():
+        if name == "id_names":
+            digest.update(b"" if value is None else repr(value).encode())
+        elif isinstance(value, Items):
+            for tensor in value.tensors().values():
+                digest.update(tensor.cpu().numpy().tobytes())
+        elif isinstance(value, Tensor):
+            digest.update(value.cpu().numpy().tobytes())
+        elif not isinstance(value, Backend):
+            digest.update(repr(value).encode())
+    return int.from_bytes(digest.digest(), "little")

@@ -69,7 +69,7 @@ _Rect = tuple[float, float, float, float]  # left, bottom, width, height in frac
 
 
 def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
-    """What to paint, from back to front, so that no box shows through another.
+    """Return what to paint from back to front, so that no box shows through another.
 
     Box a, moved by t away from the camera in direction v, meets box b while their intervals overlap
     on every axis. With y reversed all v_k > 0, and that is for::
@@ -129,7 +129,7 @@ def draw(
     title: str = "",
     pixels: tuple[int, int] = (960, 600),
 ) -> NDArray[np.uint8]:
-    """Picture of a bin: from left to right the item to come, the bin, and where the item may go.
+    """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
     The box placed last has a thick outline, in the bin and on the heightmaps. The item is drawn at
     the bin's scale, in the colour it will have, and smaller only if there is no room.
@@ -187,7 +187,7 @@ def _check(
     labels: Sequence[str],
     pixels: tuple[int, int],
 ) -> NDArray[np.int64]:
-    """The boxes as int64 [n, 6], once everything that :func:`draw` was given is found right."""
+    """Check the arguments of :func:`draw`, and return the boxes as int64 [n, 6]."""
     boxes = np.asarray(boxes)
     if len(size) != 3 or min(size) < 1:
         raise ValueError(f"size {size!r}: needs three sides W, D, H of at least 1")
@@ -232,8 +232,8 @@ def _draw_bin(
     _add_boxes(axes, boxes)
     _add_lines(axes, edges[near], _FAINT, 0.6)
     if len(boxes):  # the outline of the last box, where others hide it
-        seen = (_EDGES != (0, 1, 0)).any(-1).all(-1)
-        _add_lines(axes, boxes[-1, :3] + _EDGES[seen] * boxes[-1, 3:], _INK, 1.0, ":")
+        visible = (_EDGES != (0, 1, 0)).any(-1).all(-1)
+        _add_lines(axes, boxes[-1, :3] + _EDGES[visible] * boxes[-1, 3:], _INK, 1.0, ":")
 
     # Scales along the three edges of the bin that bound its picture below and to the right.
     origins = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0)]) * size
@@ -308,8 +308,8 @@ def _draw_masks(
             x, y, _, w, d, _ = boxes[-1].tolist()
             axes.add_patch(Rectangle((x, y), w, d, fill=False, edgecolor=_INK, linewidth=1.6))
         cells = int(np.count_nonzero(mask))
-        found = {0: "none", 1: "1 cell"}.get(cells, f"{cells} cells")
-        heading = f"{labels[i]}\n{found}" if labels else found
+        amount = {0: "none", 1: "1 cell"}.get(cells, f"{cells} cells")
+        heading = f"{labels[i]}\n{amount}" if labels else amount
         axes.set_title(heading, size=9, pad=5, color=_INK if cells else _BARRED)
         axes.set_xticks((0, width))
         axes.set_yticks((0, depth))
@@ -325,7 +325,7 @@ def _draw_masks(
 def _axes(
     figure: Figure, rect: _Rect, size: tuple[int, int, int], scale: float = np.inf
 ) -> tuple[Axes, float]:
-    """Axes for projected points in which a box of ``size`` fills ``rect``, and their scale.
+    """Return axes for projected points in which a box of ``size`` fills ``rect``, and their scale.
 
     The scale is in pixels per cell, and no larger than ``scale``.
     """
@@ -342,7 +342,7 @@ def _axes(
 
 
 def _project(points: ArrayLike) -> NDArray[np.float64]:
-    """Picture [..., 2], right and up, of points [..., 3]; lengths across the view are kept."""
+    """Project points [..., 3] to the picture, right and up [..., 2], without changing scale."""
     picture: NDArray[np.float64] = np.asarray(points) @ _PROJECTION
     return picture
 
@@ -369,7 +369,7 @@ def _add_boxes(
     colours: Sequence[str] = PALETTE,
     last_edge: float = 2.4,
 ) -> None:
-    """Add the faces that the camera sees of boxes, the last box with edges so many points wide."""
+    """Add the visible faces of boxes, the last box with edges ``last_edge`` points wide."""
     outlines: list[NDArray[np.float64]] = []
     fills: list[NDArray[np.float64]] = []
     edges: list[float] = []

@@ -1,21 +1,13 @@
-"""Physics has the last word: SAPIEN builds a stack box by box and says what moved.
+"""The judge of stacks: it builds a stack box by box in SAPIEN (PhysX) and reports what moved.
 
-Independent of how a stack was made: :class:`Stack` takes boxes in cells and makes metres of them,
-:func:`check` judges the stack after its last placement and :func:`judge` after each.
+It knows nothing of how a stack was packed: :class:`Stack` takes a :class:`marl_pack.plan.Plan` or
+rows of boxes, :func:`check` judges it after its last placement and :func:`judge` after each.
 ``python -m marl_pack.sapien_check --help`` lists the commands.
 """
 
-from marl_pack.sapien_check.judge import (
-    Judged,
-    Pass,
-    Physics,
-    SimulationError,
-    Verdict,
-    check,
-    judge,
-    judge_all,
-)
+from marl_pack.sapien_check.judge import Judged, Verdict, check, judge, judge_all
 from marl_pack.sapien_check.stack import Stack
+from marl_pack.sapien_check.world import Pass, Physics, SimulationError
 
 __all__ = [
     "Judged",

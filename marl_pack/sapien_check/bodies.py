@@ -1,47 +1,29 @@
-"""Packings as they were played, made into stacks: what the boxes weigh and where their centres are.
+"""What packed boxes really are: their masses and centres of mass, drawn or as packed.
 
-A stability rule knows the boxes by what it is told of them. Here the truth may differ: densities
-and centres of mass drawn for each item show what a guarantee is worth outside its assumptions.
+A stability rule knows the boxes by what its masks were given. Here the truth may differ: densities
+and centres of mass drawn for each item show how good a guarantee is outside its assumptions.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from marl_pack.sapien_check.stack import DENSITY, Stack, cell_size
-
-
-class Packings(Protocol):
-    """Packings of E episodes, as :class:`marl_pack.evaluate.Episodes` holds them."""
-
-    @property
-    def size(self) -> tuple[int, int, int]:
-        """(W, D, H) in cells."""
-
-    @property
-    def packed(self) -> NDArray[np.int64]:
-        """Number of boxes, [E]."""
-
-    @property
-    def boxes(self) -> NDArray[np.int16]:
-        """Rows x, y, z, w, d, h in order of placement, [E, M, 6]."""
-
-    @property
-    def loads(self) -> NDArray[np.float64]:
-        """Weight and x, y of the centre of mass of each box, as the rule was told, [E, M, 3]."""
+from marl_pack.plan import Plan
+from marl_pack.sapien_check.stack import DENSITY, Stack, cell_of, offsets_of
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """What the boxes of a packing really are."""
+    """How the boxes of a plan become bodies with a mass and a centre of mass.
 
-    cell: float | None = None  # metres; None: the bin's longest side is 0.6 m
+    Raises:
+        ValueError: for a value that cannot be.
+    """
+
+    cell: float | None = None  # metres of a unit of length; None: see stack.cell_of
     density: tuple[float, float] | None = (
         None  # kg/m³, drawn between (log-uniform); None: as packed
     )
@@ -61,60 +43,43 @@ class Bodies:
         if self.seed < 0:
             raise ValueError(f"seed = {self.seed}: needs 0 or more")
 
-    @classmethod
-    def add_options(cls, parser: argparse.ArgumentParser) -> None:
-        """Add the options of :meth:`from_options` to a command."""
-        add = parser.add_argument
-        add("--cell", type=float, metavar="METRES",
-            help="edge of a cell (default: the bin's longest side is 0.6 m)")  # fmt: skip
-        add("--density", nargs=2, type=float, metavar=("LOW", "HIGH"),
-            help="density of each box, drawn between these, in kg/m³ "
-                 "(default: as packed)")  # fmt: skip
-        add("--com-spread", type=float, metavar="SHARE",
-            help="centre of mass of each box, drawn up to this share of each side off "
-                 "(default: 0)")  # fmt: skip
+    def stacks(self, plans: Sequence[Plan], episodes: Iterable[int]) -> Iterator[Stack]:
+        """Yield the stacks of the chosen plans."""
+        return (self.stack(plans[e], e) for e in episodes)
 
-    @classmethod
-    def from_options(cls, options: argparse.Namespace) -> Bodies:
-        """What a command's ``--cell``, ``--density``, ``--com-spread`` and ``--seed`` say."""
-        density = None if options.density is None else (options.density[0], options.density[1])
-        return cls(options.cell, density, options.com_spread or 0.0, options.seed)
+    def stack(self, plan: Plan, episode: int) -> Stack:
+        """Return the stack of one plan.
 
-    def stacks(self, played: Packings, episodes: Iterable[int]) -> Iterator[Stack]:
-        """The stacks of the chosen episodes."""
-        return (self.stack(played, e) for e in episodes)
+        As packed, a box has its weight in units³ of the standard density. A plan does not say how
+        high a centre of mass lies in its box; it is put in the middle, which moves no tipping
+        point.
 
-    def stack(self, played: Packings, episode: int) -> Stack:
-        """The stack of one episode.
-
-        Weights are in cells of the standard density, or a file's. How high a centre of mass lies
-        in its box was not kept; it is put in the middle, which moves no tipping point.
+        Args:
+            plan: boxes in one bin.
+            episode: number of the plan, which with the seed decides what is drawn.
 
         Raises:
             ValueError: naming the episode and the box, if the stack cannot be.
         """
-        n, size = int(played.packed[episode]), played.size
-        boxes, loads = played.boxes[episode, :n], played.loads[episode, :n]
-        sides = boxes[:, 3:].astype(np.float64)
-        cell = cell_size(size) if self.cell is None else self.cell
+        cell = cell_of(plan) if self.cell is None else self.cell
         rng = np.random.default_rng((self.seed, episode))
         low, high = self.density or (DENSITY, DENSITY)
-        drawn = np.exp(rng.uniform(np.log(low), np.log(high), len(boxes)))
-        volume = loads[:, 0] if self.density is None else sides.prod(1)
-        offset = np.zeros((len(boxes), 3))
-        offset[:, :2] = (loads[:, 1:] - boxes[:, :2]) / sides[:, :2] - 0.5
-        offset += rng.uniform(-self.com_spread, self.com_spread, (len(boxes), 3))
+        drawn = np.exp(rng.uniform(np.log(low), np.log(high), len(plan)))
+        sides = plan.sides.astype(np.float64)
+        volume = plan.weights if self.density is None else sides.prod(1)
+        offset = offsets_of(plan)
+        offset += rng.uniform(-self.com_spread, self.com_spread, (len(plan), 3))
         mass = drawn * volume * cell**3
         try:
-            return Stack.of_cells(size, boxes, cell=cell, mass=mass, com_offset=offset)
+            return Stack.of_plan(plan, cell=cell, mass=mass, com_offset=offset)
         except ValueError as error:
             raise ValueError(f"episode {episode}: {error}") from None
 
     def __str__(self) -> str:
-        """In words, empty if all is as it was packed."""
-        said = []
+        """Return the bodies in words, empty if all is as it was packed."""
+        words = []
         if self.density is not None:
-            said.append(f"densities {self.density[0]:g} to {self.density[1]:g}")
+            words.append(f"densities {self.density[0]:g} to {self.density[1]:g}")
         if self.com_spread:
-            said.append(f"centres of mass up to {self.com_spread:g} off")
-        return ", ".join(said)
+            words.append(f"centres of mass up to {self.com_spread:g} off")
+        return ", ".join(words)

@@ -1,4 +1,4 @@
-"""Boxes in a bin, in metres and kilograms, as the judge takes them."""
+"""Boxes in a bin in metres and kilograms: the judge's view of a plan or of rows of boxes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marl_pack.plan import Plan
+
 Floats = NDArray[np.float64]
 
 SLACK = 1e-6
@@ -18,13 +20,13 @@ PAPER_BIN = 0.6
 """Edge of the paper's bin in metres (sec. IV-A)."""
 
 DENSITY = 500.0
-"""What the commands take for the density of a filled carton, kg/m³. Verdicts depend on the boxes'
-masses relative to one another alone."""
+"""Density of a filled carton in kg/m³, as the commands assume it. Verdicts depend on the ratios of
+the boxes' masses alone."""
 
 
 @dataclass(frozen=True)
 class Stack:
-    """n boxes in order of placement; made by :meth:`of_cells`, which looks at what it is given."""
+    """n boxes in order of placement; :meth:`of_plan` and :meth:`of_cells` check what they make."""
 
     size: Floats  # [3]      the bin's inner sides, m
     low: Floats  # [n, 3]    low corner of each box, m
@@ -43,7 +45,7 @@ class Stack:
         mass: ArrayLike | None = None,
         com_offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Stack:
-        """Boxes given in cells.
+        """Return the stack of boxes given in cells.
 
         Args:
             size: the bin's W, D, H in cells.
@@ -60,11 +62,11 @@ class Stack:
                 that is not positive; for a mass that is not positive, a centre of mass outside its
                 box, or any number that is not finite.
         """
-        given = np.asarray(boxes, np.float64)
-        if given.size == 0:
-            given = given.reshape(0, 6)
-        if given.ndim != 2 or given.shape[1] != 6:
-            raise ValueError(f"boxes: shape {given.shape}, needs [n, 6]: x, y, z, w, d, h")
+        rows = np.asarray(boxes, np.float64)
+        if rows.size == 0:
+            rows = rows.reshape(0, 6)
+        if rows.ndim != 2 or rows.shape[1] != 6:
+            raise ValueError(f"boxes: shape {rows.shape}, needs [n, 6]: x, y, z, w, d, h")
         inner = np.asarray(size, np.float64)
         if inner.shape != (3,) or not (np.isfinite(inner) & (inner > 0)).all():
             raise ValueError(f"bin size {size!r}: needs three positive numbers of cells, W D H")
@@ -74,57 +76,90 @@ class Stack:
             raise ValueError(f"cell = {cell}: needs a positive length in metres")
         if (density is None) == (mass is None):
             raise ValueError("give either the density (kg/m³) or the mass (kg) of the boxes")
-        low, sides = given[:, :3] * cell, given[:, 3:] * cell
-        weights = _each(density if mass is None else mass, len(given), (), "density or mass")
+        low, sides = rows[:, :3] * cell, rows[:, 3:] * cell
+        weights = _each(density if mass is None else mass, len(rows), (), "density or mass")
         _refuse(~(np.isfinite(weights) & (weights > 0)), weights, "needs a positive mass")
-        offset = _each(com_offset, len(given), (3,), "com_offset")
+        offset = _each(com_offset, len(rows), (3,), "com_offset")
         inside = (np.abs(offset) < 0.5).all(1)  # false for NaN, too
         _refuse(~inside, offset, "needs a centre of mass inside the box")
         with np.errstate(over="ignore"):
             weights = weights * sides.prod(1) if mass is None else weights
         stack = cls(inner * cell, low, sides, weights, offset * sides)
-        stack.check(given)
-        _refuse(~(np.isfinite(weights) & (weights > 0)), given, "its mass is not a number > 0")
+        stack.check(rows)
+        _refuse(~(np.isfinite(weights) & (weights > 0)), rows, "its mass is not a number > 0")
         return stack
+
+    @classmethod
+    def of_plan(
+        cls,
+        plan: Plan,
+        *,
+        cell: float | None = None,
+        density: ArrayLike | None = None,
+        mass: ArrayLike | None = None,
+        com_offset: ArrayLike | None = None,
+    ) -> Stack:
+        """Return the stack of a plan's boxes.
+
+        Args:
+            plan: boxes in one bin; of several, ``plan.in_bin(k)`` has one.
+            cell: metres of a unit of length; by default see :func:`cell_of`.
+            density: kg/m³, one for all or [n], in place of the plan's weights.
+            mass: kg, one for all or [n], in place of the plan's weights.
+            com_offset: as :meth:`of_cells` takes it; by default as the plan says, in the middle of
+                the height.
+
+        Raises:
+            ValueError: as :meth:`of_cells`, or for a plan of several bins.
+        """
+        if len(plan.bin_sizes) != 1:
+            raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: judge each, plan.in_bin(k)")
+        if density is None and mass is None:
+            mass = plan.weights
+        return cls.of_cells(
+            plan.bin_sizes[0].tolist(), plan.boxes, cell=cell_of(plan) if cell is None else cell,
+            density=density, mass=mass,
+            com_offset=offsets_of(plan) if com_offset is None else com_offset,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.low)
 
     @property
     def high(self) -> Floats:
-        """High corner of each box, [n, 3]."""
+        """High corner of each box in metres, [n, 3]."""
         return self.low + self.sides
 
     @property
     def middle(self) -> Floats:
-        """Middle of each box, [n, 3]."""
+        """Middle of each box in metres, [n, 3]."""
         return self.low + self.sides / 2
 
     def scaled(self, scale: float) -> Stack:
-        """The same stack with lengths times ``scale`` and a mean mass of 1 kg."""
+        """Return the stack with lengths times ``scale`` and a mean mass of 1 kg."""
         lengths = (self.size, self.low, self.sides, self.com)
         size, low, sides, com = (length * scale for length in lengths)
         return Stack(size, low, sides, self.mass / self.mass.mean(), com)
 
     def first(self, count: int) -> Stack:
-        """The stack as it was when ``count`` boxes had been placed."""
+        """Return the stack as it was when ``count`` boxes had been placed."""
         if not 0 <= count <= len(self):
             raise ValueError(f"count = {count}: needs 0 … {len(self)}")
         return self.only(slice(count))
 
     def only(self, which: slice | NDArray[np.intp]) -> Stack:
-        """These boxes of the stack alone, in the order given."""
+        """Return these boxes of the stack alone, in this order."""
         arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
     def rests_on(self) -> NDArray[np.bool_]:
-        """Bool [n, n]: whether box i touches box j from above, on more than an edge."""
+        """Return, bool [n, n], whether box i touches box j from above on more than an edge."""
         low, high = self.low, self.high
         meet = np.abs(low[:, None, 2] - high[None, :, 2]) < SLACK
         return meet & (overlaps(low, high)[..., :2] > SLACK).all(-1)
 
     def check(self, named: NDArray[np.floating[Any]] | None = None) -> None:
-        """Refuse a stack that cannot be.
+        """Refuse a stack that cannot exist.
 
         Args:
             named: rows by which to name the boxes; metres by default.
@@ -143,29 +178,45 @@ class Stack:
         shared = np.tril((overlaps(self.low, self.high) > SLACK).all(-1), -1)
         for i, j in np.argwhere(shared)[:1]:
             raise ValueError(f"{_name(i, rows)} overlaps {_name(j, rows)}")
-        held = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < SLACK)
-        _refuse(~held, rows, "floats: it rests neither on the floor nor on an earlier box")
+        resting = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < SLACK)
+        _refuse(~resting, rows, "floats: it rests neither on the floor nor on an earlier box")
 
 
 def cell_size(size: Sequence[float]) -> float:
-    """Metres of a cell where the bin's longest side is the paper's 0.6 m."""
+    """Return the metres of a cell where the bin's longest side is the paper's 0.6 m."""
     return PAPER_BIN / float(max(size))
 
 
+def cell_of(plan: Plan) -> float:
+    """Return the metres of a plan's unit: its own, else the paper's for a bin of that size."""
+    return cell_size(plan.bin_sizes[0]) if plan.unit_mm is None else plan.unit_mm / 1000
+
+
+def offsets_of(plan: Plan) -> Floats:
+    """Return each centre of mass from its box's middle in fractions of w, d, h, [n, 3].
+
+    A plan does not say how high it lies: in the middle.
+    """
+    offset = np.zeros((len(plan), 3))
+    offset[:, :2] = (plan.centres - plan.positions[:, :2]) / plan.sides[:, :2] - 0.5
+    return offset
+
+
 def overlaps(low: Floats, high: Floats) -> Floats:
-    """Length that boxes i and j share along each axis, [n, n, 3]; negative for a gap."""
+    """Return the length that boxes i and j share on each axis, [n, n, 3]; negative for a gap."""
     return np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
 
 
 def _each(value: ArrayLike | None, n: int, shape: tuple[int, ...], name: str) -> Floats:
-    """One for all or one each, as float64 [n, …]."""
-    given = np.asarray(value, np.float64)
-    if given.shape not in (shape, (n, *shape)):
-        raise ValueError(f"{name}: shape {given.shape}, needs {shape} or {(n, *shape)}")
-    return np.broadcast_to(given, (n, *shape)).copy()
+    """Return one value for all or one each as float64 [n, …]."""
+    values = np.asarray(value, np.float64)
+    if values.shape not in (shape, (n, *shape)):
+        raise ValueError(f"{name}: shape {values.shape}, needs {shape} or {(n, *shape)}")
+    return np.broadcast_to(values, (n, *shape)).copy()
 
 
 def _name(i: int, rows: NDArray[np.floating[Any]]) -> str:
+    """Return a box's number and row, as messages name it."""
     return f"box {i} ({', '.join(f'{value:g}' for value in np.atleast_1d(rows[i]))})"
 
 

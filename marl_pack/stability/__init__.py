@@ -1,11 +1,11 @@
-"""Stability rules: where may a box be set down so that nothing falls?
+"""Stability rules: where a box may be placed so that nothing falls.
 
 Every rule has one signature, :data:`Rule`, and a name in :data:`RULES`; :func:`make_rule` binds its
 parameters. From the strictest to the loosest, ``hull_alpha`` ⊂ ``lbcp`` ⊂ ``equilibrium`` ⊂
-``hull_1``; ``area_ratio`` and ``none`` stand beside them and are not sound. What each says, one
-window at a time, is in :mod:`marl_pack.stability.reference`.
+``hull_1``; ``area_ratio`` and ``none`` are outside this order and not sound.
+:mod:`marl_pack.stability.reference` defines what each says, one window at a time.
 
-:func:`stable_mask` answers for plain NumPy arrays, without an environment.
+:func:`stable_mask` computes the mask of plain NumPy arrays, without an environment.
 """
 
 from marl_pack.stability.arrays import stable_mask

@@ -14,15 +14,28 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from marl_pack import bins as state
-from marl_pack.bins import Bins, footprint
-from marl_pack.stability.hull_cpu import envelope
-from marl_pack.stability.hull_torch import PAIR_CELLS, boundary, windows
+from marl_pack.bins import Bins
+from marl_pack.geometry.compiled import place_box
+from marl_pack.geometry.tensor import cut_windows, footprint, place_boxes
+from marl_pack.stability.hull_exact import envelope, row_extremes
+from marl_pack.stability.hull_tensor import PAIR_CELLS, boundary
+
+
+def lbcp_bearing(bins: Bins) -> Tensor:
+    """Return the columns whose top carries any load, bool [N, W, D], from the placed boxes.
+
+    The floor carries everywhere. A box carries on those cells of its top whose whole square lies
+    in the hull of the bearing squares it rests on.
+    """
+    return bins.backend.pick(compiled=_bearing_compiled, tensor=_bearing_tensor)(bins)
+
+
+# --- compiled -------------------------------------------------------------------------------------
 
 
 @njit(cache=True)
 def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
-    """The chain's y at ``x``, rounded into the hull (sign +1: upper chain, down)."""
+    """Return a chain's y at ``x``, rounded into the hull (sign +1: upper chain, down)."""
     for i in range(size - 1):
         ax, ay, bx, by = chain[i, 0], chain[i, 1], chain[i + 1, 0], chain[i + 1, 1]
         if ax <= x <= bx:
@@ -31,17 +44,13 @@ def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
 
 
 @njit(cache=True)
-def _carry(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
+def _fill_hull(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
     """Fill ``cells`` [w, d] up to the hull of its true squares: whole squares only."""
     w, d = cells.shape
     if cells[0, 0] and cells[0, d - 1] and cells[w - 1, 0] and cells[w - 1, d - 1]:
         cells[:] = True
         return
-    for i in range(w):
-        lo[i], hi[i] = d, -1
-        for j in range(d):
-            if cells[i, j]:
-                lo[i], hi[i] = min(lo[i], j), j
+    row_extremes(cells, lo, hi)
     n_upper, n_lower = envelope(lo[:w], hi[:w], upper, lower)
     if n_upper == 0:
         return
@@ -53,37 +62,50 @@ def _carry(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _bearing_cpu(boxes: Any, count: Any, out: Any) -> None:
+def _replay(boxes: Any, count: Any, out: Any) -> None:
+    """Write the bearing columns [N, W, D] by placing the boxes [N, M, 6] one after the other."""
     n, width, depth = out.shape
-    height = np.empty((width, depth), np.int64)
+    heightmap = np.empty((width, depth), np.int64)
+    empty_map = np.zeros((width, depth), np.int64)  # not used
     lo, hi = np.empty(width, np.int64), np.empty(width, np.int64)
     upper, lower = np.empty((2 * width + 2, 2), np.int64), np.empty((2 * width + 2, 2), np.int64)
     for b in range(n):
-        height[:] = 0
+        heightmap[:] = 0
         out[b] = True
         for k in range(count[b]):
             x, y, z, w, d, h = boxes[b, k]
             cells = out[b, x : x + w, y : y + d]
             for i in range(w):
                 for j in range(d):
-                    cells[i, j] &= height[x + i, y + j] == z
-                    height[x + i, y + j] = z + h
-            _carry(cells, lo, hi, upper, lower)
+                    cells[i, j] &= heightmap[x + i, y + j] == z
+            place_box(heightmap, empty_map, x, y, w, d, h)
+            _fill_hull(cells, lo, hi, upper, lower)
 
 
-def _bearing_torch(bins: Bins) -> Tensor:
-    """The same box by box, all bins at once."""
+def _bearing_compiled(bins: Bins) -> Tensor:
+    """Compute :func:`lbcp_bearing` in compiled loops."""
+    out = np.empty(tuple(bins.heightmap.shape), np.bool_)
+    _replay(bins.boxes.contiguous().numpy(), bins.count.numpy(), out)
+    return torch.from_numpy(out)
+
+
+# --- tensor code ----------------------------------------------------------------------------------
+
+
+def _bearing_tensor(bins: Bins) -> Tensor:
+    """Compute :func:`lbcp_bearing` in tensor code, box by box and all bins at once."""
     n, (width, depth, _) = len(bins), bins.size
-    height = torch.zeros_like(bins.heightmap)
-    bearing = torch.ones_like(height, dtype=torch.bool)
+    heightmap = torch.zeros_like(bins.heightmap)
+    bearing = torch.ones_like(heightmap, dtype=torch.bool)
     for k in range(int(bins.count.max()) if n else 0):
-        here = torch.nonzero(bins.count > k).squeeze(1)
-        corner, rest, sides = bins.boxes[here, k].long().tensor_split((2, 3), 1)
-        under = footprint(width, depth, sides, corner[:, 0] * depth + corner[:, 1])
-        x, y = corner[:, 0], corner[:, 1]
-        held = bearing[here] & (height[here] == rest[:, None]) & under
-        rows = torch.arange(len(here), device=bins.device)
-        window, member = windows(held, rows, x, y, sides)
+        which = torch.nonzero(bins.count > k).squeeze(1)
+        corner, z, sides = bins.boxes[which, k].long().tensor_split((2, 3), 1)
+        under = footprint(width, depth, sides, corner)
+        x, y = corner.T
+        below = heightmap[which]
+        contact = bearing[which] & (below == z[:, None]) & under
+        rows = torch.arange(len(which), device=bins.device)
+        window, member = cut_windows(contact, rows, x, y, sides)
         present, upper, lower = boundary(window & member)
         top, bottom = _rounded(upper, present), _rounded(lower, present)
         top = torch.minimum(top[:, :-1], top[:, 1:])  # over each row of cells
@@ -91,19 +113,22 @@ def _bearing_torch(bins: Bins) -> Tensor:
         i = torch.arange(width, device=bins.device) - x[:, None]
         j = torch.arange(depth, device=bins.device) - y[:, None]
         i = i.clamp(0, top.shape[1] - 1)
-        above = j[:, None, :] >= -bottom.gather(1, i)[:, :, None]
-        below = j[:, None, :] + 1 <= top.gather(1, i)[:, :, None]
-        bearing[here] = torch.where(under, above & below, bearing[here])
-        height[here] = torch.where(
-            under, (rest + sides[:, 2:])[:, :, None], height[here].long()
-        ).to(height.dtype)
+        above_lower = j[:, None, :] >= -bottom.gather(1, i)[:, :, None]
+        below_upper = j[:, None, :] + 1 <= top.gather(1, i)[:, :, None]
+        bearing[which] = torch.where(under, above_lower & below_upper, bearing[which])
+        place_boxes(below, torch.zeros_like(below), under, sides[:, 2])
+        heightmap[which] = below
     return bearing
 
 
 def _rounded(points: Tensor, present: Tensor) -> Tensor:
-    """The upper chain of the hull over x = 0 … P - 1, rounded down, int64 [U, P].
+    """Return the upper chain of the hull over x = 0 … P - 1, rounded down, int64 [U, P].
 
-    The floor of a maximum is the maximum of the floors, so every pair of points may speak.
+    The floor of a maximum is the maximum of the floors, so every pair of points may contribute.
+
+    Args:
+        points: int64 [U, P], height of the hull's boundary points.
+        present: bool [U, P], which of them exist.
     """
     size = points.shape[1]
     x = torch.arange(size, device=points.device)
@@ -114,20 +139,11 @@ def _rounded(points: Tensor, present: Tensor) -> Tensor:
     chunk = max(1, PAIR_CELLS // size**3)
     low = torch.iinfo(points.dtype).min
     for start in range(0, len(points), chunk):
-        p, here = points[start : start + chunk], present[start : start + chunk]
+        p, real = points[start : start + chunk], present[start : start + chunk]
         ey = p[:, None, :] - p[:, :, None]
         rise = torch.div(ey[..., None] * run, ex[:, :, None], rounding_mode="floor")
-        ok = between & here[:, :, None, None] & here[:, None, :, None]
+        ok = between & real[:, :, None, None] & real[:, None, :, None]
         out[start : start + chunk] = (
             torch.where(ok, p[:, :, None, None] + rise, low).flatten(1, 2).amax(1)
         )
     return out.clamp(min=-(1 << 30))
-
-
-def lbcp_bearing(bins: Bins) -> Tensor:
-    """Bool [N, W, D]: the columns whose top carries any load, replayed from the placed boxes."""
-    if not state.compiled(bins.device):
-        return _bearing_torch(bins)
-    out = np.empty(tuple(bins.heightmap.shape), np.bool_)
-    _bearing_cpu(bins.boxes.contiguous().numpy(), bins.count.numpy(), out)
-    return torch.from_numpy(out)

@@ -1,4 +1,4 @@
-"""What a stability rule is asked about: an item in its candidate orientations, per bin."""
+"""The oriented item that a stability rule judges: one item per bin in several orientations."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from marl_pack.bins import ORIENTATIONS, Bins, oriented
+from marl_pack.bins import Bins
+from marl_pack.geometry import ORIENTATIONS, oriented
 
 
 @dataclass(frozen=True)
 class OrientedItem:
-    """One item per bin, turned in A ways. ``None`` means uniform mass (weight = volume)."""
+    """One item per bin in A orientations. ``None`` means uniform mass (weight = volume)."""
 
-    sides: Tensor  # int16 [N, A, 3]            w, d, h along x, y, z; a zero side: not a candidate
+    sides: Tensor  # int16 [N, A, 3]  w, d, h along x, y, z; a zero side: orientation not allowed
     com: Tensor | None = None  # float64 [N, A, 2]  centre of mass from the window's low corner
     weight: Tensor | None = None  # float64 [N]
 
     def __getitem__(self, index: Tensor | slice) -> OrientedItem:
-        """The candidates of the chosen bins."""
+        """Return the oriented items of the chosen bins."""
         return OrientedItem(
             self.sides[index],
             None if self.com is None else self.com[index],
@@ -28,19 +29,20 @@ class OrientedItem:
         )
 
     def centres(self) -> Tensor:
-        """Centre of mass from the window's low corner, float64 [N, A, 2]."""
+        """Return the centres of mass from the window's low corner, float64 [N, A, 2]."""
         return self.sides[..., :2].double() / 2 if self.com is None else self.com
 
     def weights(self) -> Tensor:
-        """Weight of each bin's item, float64 [N]."""
+        """Return the weight of each bin's item, float64 [N]."""
         if self.weight is not None:
             return self.weight.double()
         return self.sides.double().prod(-1).amax(1)
 
 
 Rule = Callable[[Bins, OrientedItem], Tensor]
-"""``(bins, candidates) -> bool [N, A, W, D]``: the cells (low corners) where each candidate fits
-into the bin and stands by the rule. Parameters are bound beforehand (:func:`functools.partial`)."""
+"""``(bins, item) -> bool [N, A, W, D]``: the cells (low corners) where the item fits into the bin
+in each orientation and is stable by the rule. Parameters are bound beforehand
+(:func:`functools.partial`)."""
 
 NO_OFFSET = (0.0, 0.0, 0.0)
 
@@ -65,20 +67,20 @@ def orient_item(
     weight: Tensor | None = None,
     com_offset: tuple[float, float, float] = NO_OFFSET,
 ) -> OrientedItem:
-    """All six orientations of one item per bin.
+    """Return one item per bin in all six orientations.
 
     Args:
         items: int [N, 3], each item's own sides w, d, h; zeros where there is no item.
         weight: float [N], volume by default.
         com_offset: how far the centre of mass lies from the geometric centre, as fractions of the
-            item's own sides; it turns with the item.
+            item's own sides; it rotates with the item.
     """
     sides = oriented(items)
     if not any(com_offset):
         return OrientedItem(sides, None, weight)
-    turned = torch.tensor(
+    offsets = torch.tensor(
         [[com_offset[axis] for axis in permutation[:2]] for permutation in ORIENTATIONS],
         dtype=torch.float64,
         device=items.device,
     )
-    return OrientedItem(sides, (0.5 + turned) * sides[..., :2], weight)
+    return OrientedItem(sides, (0.5 + offsets) * sides[..., :2], weight)

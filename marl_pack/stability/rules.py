@@ -12,28 +12,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack import bins as state
 from marl_pack.bins import Bins
-from marl_pack.stability import hull_cpu, hull_torch, support_area
+from marl_pack.stability import hull_compiled, hull_tensor, support_area
+from marl_pack.stability.equilibrium_masks import equilibrium_mask
 from marl_pack.stability.load_bearing import lbcp_bearing
 from marl_pack.stability.oriented_item import OrientedItem, Rule
-from marl_pack.stability.static_equilibrium import equilibrium_mask
 
 
-def _supported(bins: Bins, item: OrientedItem, hollow: Tensor, margin: float) -> Tensor:
-    if not state.compiled(bins.device):
-        return hull_torch.support_mask(
-            bins.heightmap, hollow, item.sides, bins.height, item.com, margin
-        )
-    com = None if item.com is None else item.com.numpy()
-    mask = hull_cpu.support_mask(
-        bins.heightmap.numpy(), hollow.numpy(), item.sides.numpy(), bins.height, com, margin
-    )
-    return torch.from_numpy(mask)
+def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float) -> Tensor:
+    """Return the convex-hull mask in which only columns with ``empty_map`` 0 count as support."""
+    code = bins.backend.pick(compiled=hull_compiled.support_mask, tensor=hull_tensor.support_mask)
+    return code(bins.heightmap, empty_map, item.sides, bins.height, item.com, margin)
 
 
 def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
-    """convexHull-1: the centre of mass strictly inside the hull of all contact squares.
+    """Return the mask of convexHull-1: all contact squares count.
+
+    The centre of mass must lie strictly inside their convex hull.
 
     Args:
         bins: N bins.
@@ -47,7 +42,7 @@ def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 
 
 def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
-    """convexHull-α (Algorithm 1): only contact squares over filled columns count.
+    """Return the mask of convexHull-α (Algorithm 1): only contact over filled columns counts.
 
     Sound for any masses and for whatever the rule places later: each weight goes straight down
     through solid columns. Arguments as :func:`hull_1`.
@@ -56,52 +51,52 @@ def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 
 
 def lbcp(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
-    """Load-bearable convex polygons: gap cells inside a box's support polygon count as well.
+    """Return the mask of load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123).
 
-    Arguments as :func:`hull_1`. The polygons are replayed from ``bins.boxes``.
+    Gap cells inside a box's support polygon count as well. The polygons are replayed from
+    ``bins.boxes``. Arguments as :func:`hull_1`.
     """
-    return _supported(bins, item, (~lbcp_bearing(bins)).to(torch.int16), margin)
+    return _supported(bins, item, ~lbcp_bearing(bins), margin)
 
 
 def area_ratio(
     bins: Bins, item: OrientedItem, thresholds: support_area.Thresholds | str = "paper"
 ) -> Tensor:
-    """Zhao et al. 2021: share of the bottom face supported, and number of its corners.
+    """Return the mask of Zhao et al. 2021: supported share of the bottom face, and corners.
 
     Args:
         bins: N bins.
-        item: their items; the centre of mass plays no part.
+        item: their items; the centre of mass is ignored.
         thresholds: ``"paper"`` (60 % and 4 corners, 80 % and 3, 95 %), ``"code"`` (50 / 85 / 95, as
             the authors' code has it), or pairs (share, corners); shares must be exceeded.
     """
     pairs = support_area.check_thresholds(thresholds)
-    if not state.compiled(bins.device):
-        return support_area.mask_torch(bins.heightmap, item.sides, bins.height, pairs)
-    mask = support_area.mask_cpu(bins.heightmap.numpy(), item.sides.numpy(), bins.height, pairs)
-    return torch.from_numpy(mask)
+    code = bins.backend.pick(compiled=support_area.mask_compiled, tensor=support_area.mask_tensor)
+    return code(bins.heightmap, item.sides, bins.height, pairs)
 
 
 def equilibrium(
     bins: Bins, item: OrientedItem, margin: float = 0.0, check_stack: bool = False
 ) -> Tensor:
-    """Exact strict equilibrium of the whole stack (:mod:`marl_pack.stability.static_equilibrium`).
+    """Return the mask of exact strict equilibrium of the whole stack.
 
-    It relies on the weights: a stack built on wrong ones may break.
+    See :mod:`marl_pack.stability.equilibrium_masks`. The rule relies on the weights: a stack built
+    on wrong ones may break.
 
     Args:
         bins: N bins whose stacks stand (or give ``check_stack``).
         item: their items in A orientations.
         margin: the centre of mass may lie anywhere within so many cells of its place.
-        check_stack: do not take for granted that what is there stands.
+        check_stack: whether to check that the stacks stand instead of assuming it.
     """
     surely, possibly = hull_alpha(bins, item, margin), hull_1(bins, item, margin)
     return equilibrium_mask(bins, item, surely, possibly, margin, check_stack)
 
 
 def none(bins: Bins, item: OrientedItem) -> Tensor:
-    """No stability rule: wherever the item fits into the bin, set down from above.
+    """Return where the item fits into the bin, placed from above, without a stability rule.
 
-    To compare with, and for the judge to have something to say no to.
+    A baseline for comparisons, and for tests of the judge.
     """
     return area_ratio(bins, item, ((0.0, 0),))
 
@@ -117,7 +112,7 @@ RULES: dict[str, Callable[..., Tensor]] = {
 
 
 def make_rule(name: str, **parameters: object) -> Rule:
-    """The rule called ``name`` with its parameters bound.
+    """Return the rule called ``name`` with its parameters bound.
 
     Raises:
         ValueError: for an unknown rule, an unknown parameter or a negative margin.

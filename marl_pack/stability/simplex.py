@@ -1,7 +1,7 @@
-"""A small dense simplex for the linear programs of static equilibrium.
+"""A small dense simplex method for the linear programs of static equilibrium.
 
-They have a dozen rows and a few dozen columns, are degenerate, and come by the thousand: the call
-of a library costs a hundred times what the pivots do.
+These programs have a dozen rows and a few dozen columns, are degenerate, and are solved by the
+thousand: the call of a library costs a hundred times as much as the pivots.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numba import njit
 
 @njit(cache=True)
 def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
+    """Bring ``column`` into the basis in place of the variable of ``row``."""
     table[row] /= table[row, column]
     for i in range(table.shape[0]):
         factor = table[i, column]
@@ -31,7 +32,7 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     largest pivot, which keeps the numbers sound; Bland's rule once that might cycle.
 
     Returns:
-        Whether it came to an end.
+        Whether it ended within the limit on iterations.
     """
     rows = basis.size
     for iteration in range(200 * rows + 1000):
@@ -66,13 +67,42 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
 
 
 @njit(cache=True)
-def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
-    """``max t, a f = weight, f ≥ t`` for ``a`` [R, m] of full row rank and ``weight`` [R] ≥ 0.
+def _solution(table: Any, basis: Any, a: Any, weight: Any) -> tuple[float, float, float]:
+    """Read the solution from a tableau and put it back into the equations.
 
     Returns:
-        The optimum, or the first value found above ``enough``; -inf if no ``f ≥ 0`` solves it. And
-        whether the forces, put back into the equations, bear it out: false where rounding errors
-        have spoilt the tableau.
+        t, the sum of the equations' absolute errors, and the least force.
+    """
+    rows, columns = a.shape
+    force, t = np.zeros(columns), 0.0
+    for i in range(rows):
+        if basis[i] < columns:
+            force[basis[i]] += table[i, columns + 1]
+        elif basis[i] == columns:
+            t = table[i, columns + 1]
+    force += t
+    lacking = 0.0
+    for i in range(rows):
+        error = weight[i]
+        for j in range(columns):
+            error -= a[i, j] * force[j]
+        lacking += abs(error)
+    return t, lacking, force.min()
+
+
+@njit(cache=True)
+def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
+    """Solve ``max t, a f = weight, f ≥ t``.
+
+    Args:
+        a: float64 [R, m], of full row rank.
+        weight: float64 [R], ≥ 0.
+        enough: a value of t at which the search may stop.
+
+    Returns:
+        The optimum, or the first value above ``enough``; -inf if no ``f ≥ 0`` solves it. And
+        whether the forces, put back into the equations, confirm it: false where rounding errors
+        have corrupted the tableau.
     """
     rows, columns = a.shape
     table = np.zeros((rows + 1, columns + 2))  # g, t, right-hand side; objective in the last row
@@ -106,18 +136,6 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
         sound = _optimise(table, basis, columns + 1, enough) and sound
         missing = 0.0
 
-    force, t = np.zeros(columns), 0.0
-    for i in range(rows):
-        if basis[i] < columns:
-            force[basis[i]] += table[i, columns + 1]
-        elif basis[i] == columns:
-            t = table[i, columns + 1]
-    force += t
-    lacking = 0.0
-    for i in range(rows):
-        rest = weight[i]
-        for j in range(columns):
-            rest -= a[i, j] * force[j]
-        lacking += abs(rest)
-    sound = sound and abs(lacking - missing) < 1e-7 and force.min() > -1e-9
+    t, lacking, least = _solution(table, basis, a, weight)
+    sound = sound and abs(lacking - missing) < 1e-7 and least > -1e-9
     return (t if feasible else -np.inf), sound

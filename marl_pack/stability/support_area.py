@@ -1,6 +1,6 @@
-"""Zhao et al. 2021: a box stands if enough of its bottom face, and enough corners, are supported.
+"""The support area rule (Zhao et al. 2021): enough of a box's bottom face and enough corners.
 
-Not sound: it knows no centre of mass and nothing of what lies below the box it looks at.
+The rule is not sound: it ignores the centre of mass, and all that lies below the box that carries.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from numba import njit
-from numpy.typing import NDArray
 from torch import Tensor
 
-from marl_pack.stability.hull_cpu import mark_valid, slide
-from marl_pack.stability.hull_torch import fits, resting_height
+from marl_pack.geometry.compiled import mark_valid, slide
+from marl_pack.geometry.tensor import fits, resting_heights, window_sum
 
 Thresholds = tuple[tuple[float, int], ...]
 
@@ -22,112 +21,121 @@ PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
 """(share of the bottom face, corners): more than the share and at least so many corners."""
 CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
 """The thresholds of the authors' released code."""
+THRESHOLDS = {"paper": PAPER, "code": CODE}
+"""The thresholds by name."""
+
+
+@njit(cache=True)
+def _stands(window: Any, z: int, share: Any, corners: Any) -> bool:
+    """Return whether a box that rests at ``z`` on ``window`` [w, d] meets one of the thresholds."""
+    w, d = window.shape
+    supported = (
+        int(window[0, 0] == z) + int(window[0, d - 1] == z)
+        + int(window[w - 1, 0] == z) + int(window[w - 1, d - 1] == z)
+    )  # fmt: skip
+    needed = 2.0
+    for k in range(share.size):
+        if supported >= corners[k]:
+            needed = min(needed, share[k])
+    spare = w * d - needed * (w * d)  # stands if fewer cells than this are missing
+    missing = 0
+    for x in range(w):
+        row = 0
+        for y in range(d):
+            row += window[x, y] != z
+        missing += row
+        if missing >= spare:
+            break
+    return bool(w * d - missing > needed * (w * d))
 
 
 @njit(cache=True, nogil=True)
-def _mask_cpu(heightmap: Any, sides: Any, height: int, share: Any, corners: Any, out: Any) -> None:
+def _fill_masks(
+    heightmap: Any, sides: Any, height: int, share: Any, corners: Any, out: Any
+) -> None:
+    """Write the masks uint8 [N, A, W, D] for thresholds given as shares and corners."""
     n, width, depth = heightmap.shape
     cells = width * depth
     buffers = np.empty((2, cells), heightmap.dtype)
     for b in range(n):
         for a in range(sides.shape[1]):
             w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
-            codes = out[b, a].reshape(cells)
+            mask = out[b, a].reshape(cells)
             if not (0 < w <= width and 0 < d <= depth and 0 < h <= height):
-                codes[:] = 0
+                mask[:] = 0
                 continue
-            mark_valid(codes, width, depth, w, d)
-            rest = slide(heightmap[b].reshape(cells), buffers[0], buffers[1], depth, w, d)
+            mark_valid(mask, width, depth, w, d, 1)
+            top = slide(heightmap[b].reshape(cells), buffers[0], buffers[1], depth, w, d)
             for i in range(cells):
-                if codes[i] == 0:
+                if mask[i] == 0:
                     continue
-                z = rest[i]
-                codes[i] = 0
-                if z + h > height:
-                    continue
-                window = heightmap[b, i // depth : i // depth + w, i % depth : i % depth + d]
-                held = (
-                    int(window[0, 0] == z) + int(window[0, d - 1] == z)
-                    + int(window[w - 1, 0] == z) + int(window[w - 1, d - 1] == z)
-                )  # fmt: skip
-                needed = 2.0
-                for k in range(share.size):
-                    if held >= corners[k]:
-                        needed = min(needed, share[k])
-                spare = w * d - needed * (w * d)  # stands if fewer cells than this are missing
-                missing = 0
-                for x in range(w):
-                    row = 0
-                    for y in range(d):
-                        row += window[x, y] != z
-                    missing += row
-                    if missing >= spare:
-                        break
-                codes[i] = w * d - missing > needed * (w * d)
+                z, x, y = top[i], i // depth, i % depth
+                window = heightmap[b, x : x + w, y : y + d]
+                mask[i] = z + h <= height and _stands(window, z, share, corners)
 
 
-def mask_cpu(
-    heightmap: NDArray[np.int16], sides: NDArray[np.int16], height: int, thresholds: Thresholds
-) -> NDArray[np.bool_]:
-    """Bool [N, A, W, D] for ``heightmap`` int16 [N, W, D] and ``sides`` int16 [N, A, 3]."""
+def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
+    """Compute the masks in compiled loops.
+
+    Args:
+        heightmap: int16 [N, W, D].
+        sides: int16 [N, A, 3], the boxes' sides along x, y, z.
+        height: H.
+        thresholds: pairs (share, corners).
+
+    Returns:
+        Bool [N, A, W, D].
+    """
     out = np.empty((*sides.shape[:2], *heightmap.shape[1:]), np.uint8)
     share = np.array([t[0] for t in thresholds])
     corners = np.array([t[1] for t in thresholds])
-    heights, sides = np.ascontiguousarray(heightmap), np.ascontiguousarray(sides)
-    _mask_cpu(heights, sides, height, share, corners, out)
-    return out.view(np.bool_)
+    heights, boxes = (np.ascontiguousarray(values.numpy()) for values in (heightmap, sides))
+    _fill_masks(heights, boxes, height, share, corners, out)
+    return torch.from_numpy(out.view(np.bool_))
 
 
-def mask_torch(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
-    """The same in tensor code: the cells at each level are counted by a summed-area table."""
+def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
+    """Compute the masks in tensor code; arguments as :func:`mask_compiled`.
+
+    The cells at each level are counted by a summed-area table.
+    """
     n, width, depth = heightmap.shape
-    ways = sides.shape[1]
+    count = sides.shape[1]
     flat = sides.flatten(0, 1).long()
-    rest = resting_height(heightmap, sides).flatten(0, 1)
-    possible = fits(flat, width, depth) & (rest + flat[:, 2, None, None] <= height)
+    z = resting_heights(heightmap, sides)
+    top = z + sides[..., 2, None, None].long()
+    possible = fits(flat, width, depth).view(z.shape) & (top <= height)
     w, d = flat[:, 0].clamp(1, width), flat[:, 1].clamp(1, depth)
-    x = torch.arange(width, device=flat.device)
-    y = torch.arange(depth, device=flat.device)
-    far_x = (x + w[:, None]).clamp(max=width)[:, :, None].expand(-1, -1, depth)
-    far_y = (y + d[:, None]).clamp(max=depth)[:, None, :].expand(-1, width, -1)
-    rows = torch.arange(len(flat), device=flat.device)[:, None, None]
-    x, y = x[:, None], y[None, :]
-
-    area = torch.zeros_like(rest, dtype=torch.int64)
+    w, d = (side.view(n, count, 1, 1) for side in (w, d))
+    area = torch.zeros_like(z, dtype=torch.int64)
     for level in torch.unique(heightmap).tolist():
-        table = torch.zeros(n, width + 1, depth + 1, dtype=torch.int64, device=flat.device)
-        table[:, 1:, 1:] = (heightmap == level).long().cumsum(1).cumsum(2)
-        table = table.repeat_interleave(ways, 0)
-        count = (
-            table[rows, far_x, far_y] - table[rows, x, far_y]
-            - table[rows, far_x, y] + table[rows, x, y]
-        )  # fmt: skip
-        area = torch.where(rest == level, count, area)
+        area = torch.where(z == level, window_sum(heightmap == level, w, d), area)
 
-    high = heightmap.repeat_interleave(ways, 0)
-    last_x, last_y = far_x - 1, far_y - 1
-    held = sum(
-        (high[rows, cx, cy] == rest).long()
+    b = torch.arange(n, device=z.device)[:, None, None, None]
+    x = torch.arange(width, device=z.device)[:, None]
+    y = torch.arange(depth, device=z.device)[None, :]
+    last_x, last_y = (x + w).clamp(max=width) - 1, (y + d).clamp(max=depth) - 1
+    supported = sum(
+        (heightmap[b, cx, cy] == z).long()
         for cx, cy in ((x, y), (x, last_y), (last_x, y), (last_x, last_y))
     )
-    face = (w * d)[:, None, None].double()
+    face = (w * d).double()
     stands = torch.zeros_like(possible)
     for share, corners in thresholds:
-        stands |= (area > share * face) & (held >= corners)
-    return (possible & stands).view(n, ways, width, depth)
+        stands |= (area > share * face) & (supported >= corners)
+    return possible & stands
 
 
 def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
-    """Return the thresholds by name (``"paper"``, ``"code"``) or as given.
+    """Return the thresholds given by name (``"paper"``, ``"code"``) or as pairs.
 
     Raises:
         ValueError: for an unknown name, a share outside [0, 1] or corners outside 0 … 4.
     """
     if isinstance(thresholds, str):
-        named = {"paper": PAPER, "code": CODE}
-        if thresholds not in named:
-            raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {sorted(named)}")
-        return named[thresholds]
+        if thresholds not in THRESHOLDS:
+            raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {list(THRESHOLDS)}")
+        return THRESHOLDS[thresholds]
     pairs = tuple((float(share), int(corners)) for share, corners in thresholds)
     if not pairs or not all(0 <= s <= 1 and 0 <= c <= 4 for s, c in pairs):
         raise ValueError(

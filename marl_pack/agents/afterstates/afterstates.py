@@ -1,17 +1,17 @@
-"""What each placement would leave for what may come next.
+"""What each placement would leave for the boxes that may come next.
 
-For every legal window of the visible item, the item is set down there in thought and ``hull_alpha``
-asked where the boxes that may come next could then stand: every box whose sides are of given
-lengths. From how many cells each of them has comes in how many it may be set down in the mean, and
-how probable it is that the next item finds a place at all, each box as probable as the other.
+For every legal window of the visible item, the item is placed there hypothetically, and
+``hull_alpha`` gives the cells where the boxes that may come next could then be placed: every box
+whose sides are of given lengths. From the number of cells of each box follow the mean number of
+feasible cells, and the probability that the next item has a feasible cell at all, each box being
+equally probable.
 
-On the CPU compiled loops in as many threads as torch has, elsewhere tensor code; both give the same
-numbers.
+Compiled loops use as many threads as torch has; tensor code gives the same numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,189 +24,199 @@ from numba import njit
 from torch import Tensor
 
 from marl_pack.agents.afterstates import bitboards
-from marl_pack.bins import ORIENTATIONS, Bins, compiled, footprint
-from marl_pack.stability import hull_cpu, hull_torch
+from marl_pack.backend import Backend
+from marl_pack.bins import Bins
+from marl_pack.geometry import ORIENTATIONS
+from marl_pack.geometry.compiled import place_box
+from marl_pack.geometry.tensor import footprint, place_boxes
+from marl_pack.stability import hull_compiled, hull_tensor
 
 MOST_LENGTHS = 5
-"""Of so many lengths of a side boxes are made at most."""
+"""Largest number of lengths of which the sides of boxes are made."""
 SHARES = 10
-"""Heights are told apart by tenths of the bin's."""
+"""Heights are distinguished by tenths of the bin's height."""
 STEPS = 6
-"""So many kinds of steps between neighbouring columns are told apart."""
+"""Number of kinds of steps between neighbouring columns that are distinguished."""
 SURFACE = SHARES + 1 + STEPS
 """Numbers that :attr:`Afterstates.surface` has for each placement."""
-AT_ONCE = 1 << 20  # cells of masks made at once
-WORTH_A_THREAD = 256  # placements
+AT_ONCE = 1 << 20
+"""Cells of masks computed at once."""
+PER_THREAD = 256
+"""Number of placements from which on several threads share the work."""
 
 
 def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
-    """At most :data:`MOST_LENGTHS` lengths from ``shortest`` to ``longest``, evenly spread."""
+    """Return at most :data:`MOST_LENGTHS` evenly spaced lengths from shortest to longest."""
     count = min(MOST_LENGTHS, longest - shortest + 1)
     return tuple(round(x) for x in np.linspace(shortest, longest, count))
 
 
 @dataclass(frozen=True)
 class Afterstates:
-    """What K legal placements would leave. Placements that are the same may share a row."""
+    """What K legal placements would leave. Placements that are equal may share a row."""
 
     index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere of any
-    counts: Tensor  # int32 [K, L, L, L]  cells where each box could be set down: w, d, h
+    counts: Tensor  # int32 [K, L, L, L]  cells where each box could be placed: w, d, h
     surface: Tensor  # float32 [K, 17]    share of the columns on each tenth of the bin's height,
     # and of the neighbours that differ by so many tenths of it, the last by so many or more
-    volume: Tensor  # int64 [K]           of the box set down, in cells
+    volume: Tensor  # int64 [K]           of the placed box, in cells
     waste: Tensor  # int64 [K]            cells that it would enclose
     filled: Tensor  # int64 [K]           cells filled in the bin with it
+    backend: Backend  # which code computes what depends on these
 
-    def of(self, which: Tensor) -> Afterstates:
-        """The same of the bins ``which``, int64 [B]; their placements' rows stay where they are."""
+    def select(self, which: Tensor) -> Afterstates:
+        """Return the afterstates of the bins ``which``, int64 [B]; the rows stay the same."""
         return replace(self, index=self.index[which])
 
-    def room(self) -> Tensor:
-        """The mean number of cells where a box that may come could be set down, float32 [K]."""
+    def feasible_cells(self) -> Tensor:
+        """Compute the mean number of cells where a box that may come could be placed.
+
+        Returns:
+            float32 [K].
+        """
         boxes = self.counts[:1].numel() or 1
         return (self.counts.flatten(1).sum(1).double() / boxes).float()
 
-    def chance(self, orientations: Sequence[int]) -> Tensor:
-        """The probability that the next item finds a place, float32 [K].
+    def feasible_probability(self, orientation_sets: Mapping[tuple[int, ...], float]) -> Tensor:
+        """Compute the probability that the next item has a feasible cell.
 
         Args:
-            orientations: indices into :data:`marl_pack.bins.ORIENTATIONS` in which it may be set
-                down.
-        """
-        if compiled(self.counts.device):
-            chance = np.empty(len(self.counts), np.float32)
-            ways = np.array([ORIENTATIONS[o] for o in orientations])
-            _chance(self.counts.numpy(), ways, chance)
-            return torch.from_numpy(chance)
-        found = self.counts > 0
-        inverse = [sorted(range(3), key=ORIENTATIONS[o].__getitem__) for o in orientations]
-        turned = [found.permute(0, *(1 + axis for axis in axes)) for axes in inverse]
-        return torch.stack(turned).any(0).flatten(1).float().mean(1)
+            orientation_sets: which orientations (indices into
+                :data:`marl_pack.geometry.ORIENTATIONS`) the next item may take, with the share of
+                items that may take exactly those; the shares sum to 1.
 
-    def spread(self, values: Tensor, mask: Tensor, elsewhere: float = 0.0) -> Tensor:
-        """Numbers [K] as a map [N, A, W, D]: where the mask is false, ``elsewhere``."""
+        Returns:
+            float32 [K].
+        """
+        code = self.backend.pick(compiled=_probability_compiled, tensor=_probability_tensor)
+        rows = [[ORIENTATIONS[o] for o in orientations] for orientations in orientation_sets]
+        shares = zip(rows, orientation_sets.values(), strict=True)
+        probability = torch.zeros(len(self.counts), dtype=torch.float64, device=self.counts.device)
+        for axes, share in shares:
+            probability += share * code(self.counts, axes)
+        return probability.float()
+
+    def as_map(self, values: Tensor, mask: Tensor, elsewhere: float = 0.0) -> Tensor:
+        """Return numbers [K] as a map [N, A, W, D]: ``elsewhere`` where the mask is false."""
         if not len(values):
             return torch.full(mask.shape, elsewhere, dtype=values.dtype, device=values.device)
         return torch.where(mask, values[self.index], elsewhere)
 
 
 def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Afterstates:
-    """What each legal placement would leave.
+    """Compute what each legal placement would leave.
 
     Args:
         bins: N bins.
         sides: int16 [N, A, 3], the item's sides along x, y, z in A orientations.
-        mask: bool [N, A, W, D], where it may be set down.
+        mask: bool [N, A, W, D], where it may be placed.
         lengths: ascending; what may come next has sides of these L lengths.
     """
-    code = _left_cpu if compiled(bins.device) else _left_torch
+    code = bins.backend.pick(compiled=afterstates_by_compiled_loops, tensor=_tensor)
     return code(bins, sides, mask, tuple(lengths))
 
 
 # --- compiled -------------------------------------------------------------------------------------
 
 
-@njit(cache=True, inline="always")
-def _same(sides: Any, b: int, a: int, e: int) -> bool:
-    return bool(
-        sides[b, a, 0] == sides[b, e, 0]
-        and sides[b, a, 1] == sides[b, e, 1]
-        and sides[b, a, 2] == sides[b, e, 2]
-    )
-
-
 @njit(cache=True, nogil=True)
 def _placements(mask: Any, sides: Any, index: Any) -> Any:
-    """Bin, orientation and cell of every legal placement, int64 [K, 4], once if alike.
+    """List bin, orientation, x and y of every legal placement, equal placements once.
 
     Args:
+        mask: bool [N, A, W, D].
+        sides: int16 [N, A, 3].
         index: int64 [N, A, W, D], written where the mask is true: each placement's row.
+
+    Returns:
+        int64 [K, 4].
     """
-    n, ways, width, depth = mask.shape
-    found = np.empty((mask.size, 4), np.int64)
+    n, count, width, depth = mask.shape
+    placements = np.empty((mask.size, 4), np.int64)
     k = 0
     for b in range(n):
-        for a in range(ways):
-            twin = a
+        for a in range(count):
+            equal = a
             for e in range(a - 1, -1, -1):
-                if _same(sides, b, a, e):
-                    twin = e
+                if (
+                    sides[b, a, 0] == sides[b, e, 0]
+                    and sides[b, a, 1] == sides[b, e, 1]
+                    and sides[b, a, 2] == sides[b, e, 2]
+                ):
+                    equal = e
             for x in range(width):
                 for y in range(depth):
                     if not mask[b, a, x, y]:
                         continue
-                    if twin < a and mask[b, twin, x, y]:
-                        index[b, a, x, y] = index[b, twin, x, y]
+                    if equal < a and mask[b, equal, x, y]:
+                        index[b, a, x, y] = index[b, equal, x, y]
                         continue
-                    found[k, 0], found[k, 1], found[k, 2], found[k, 3] = b, a, x, y
+                    row = placements[k]
+                    row[0], row[1], row[2], row[3] = b, a, x, y
                     index[b, a, x, y] = k
                     k += 1
-    return found[:k]
+    return placements[:k]
 
 
 @njit(cache=True, nogil=True)
-def _set_down(
-    heightmap: Any, empty_map: Any, sides: Any, placements: Any, heights: Any, hollow: Any
-) -> None:
-    """The maps after each placement [K, W, D]."""
+def _place_each(
+    heightmap: Any, empty_map: Any, sides: Any, placements: Any, heightmaps: Any, empty_maps: Any,
+    waste: Any,
+) -> None:  # fmt: skip
+    """Write the maps after each placement and the wasted cells.
+
+    Args:
+        heightmap: int16 [N, W, D].
+        empty_map: int16 [N, W, D].
+        sides: int16 [N, A, 3].
+        placements: int64 [K, 4], bin, orientation, x and y.
+        heightmaps: int16 [K, W, D], written.
+        empty_maps: int16 [K, W, D], written.
+        waste: int64 [K], written.
+    """
     width, depth = heightmap.shape[1:]
     for k in range(placements.shape[0]):
         b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
-        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
-        z = 0
-        for i in range(x, x + w):
-            for j in range(y, y + d):
-                z = max(z, heightmap[b, i, j])
         for i in range(width):
             for j in range(depth):
-                heights[k, i, j], hollow[k, i, j] = heightmap[b, i, j], empty_map[b, i, j]
-        for i in range(x, x + w):
-            for j in range(y, y + d):
-                hollow[k, i, j] += z - heightmap[b, i, j]
-                heights[k, i, j] = z + h
+                heightmaps[k, i, j], empty_maps[k, i, j] = heightmap[b, i, j], empty_map[b, i, j]
+        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
+        _, waste[k] = place_box(heightmaps[k], empty_maps[k], x, y, w, d, h)
 
 
 @njit(cache=True, nogil=True)
-def _describe(
-    heights: Any, hollow: Any, before: Any, height: int, surface: Any, waste: Any
-) -> None:
-    """Surface and waste of each placement.
-
-    Args:
-        heights, hollow: int16 [K, W, D], after it.
-        before: int64 [K], cells of ``hollow`` before it, over the whole floor.
-        height: H.
-        surface, waste: as in :class:`Afterstates`, written.
-    """
-    width, depth = heights.shape[1:]
+def _describe(heightmaps: Any, height: int, surface: Any) -> None:
+    """Write the surface of maps int16 [K, W, D] as in :class:`Afterstates`."""
+    width, depth = heightmaps.shape[1:]
     columns = np.float32(width * depth)
     pairs = np.float32(max(1, (width - 1) * depth + width * (depth - 1)))
-    for k in range(heights.shape[0]):
+    tenths = np.arange(height + 1) * SHARES // height
+    for k in range(heightmaps.shape[0]):
         surface[k] = 0
-        empty = 0
         for i in range(width):
             for j in range(depth):
-                level = heights[k, i, j]
-                empty += hollow[k, i, j]
-                surface[k, level * SHARES // height] += 1
+                level = heightmaps[k, i, j]
+                surface[k, tenths[level]] += 1
                 if i:
-                    step = abs(level - heights[k, i - 1, j]) * SHARES // height
+                    step = tenths[abs(level - heightmaps[k, i - 1, j])]
                     surface[k, SHARES + 1 + min(step, STEPS - 1)] += 1
                 if j:
-                    step = abs(level - heights[k, i, j - 1]) * SHARES // height
+                    step = tenths[abs(level - heightmaps[k, i, j - 1])]
                     surface[k, SHARES + 1 + min(step, STEPS - 1)] += 1
         surface[k, : SHARES + 1] /= columns
         surface[k, SHARES + 1 :] /= pairs
-        waste[k] = empty - before[k]
 
 
 @njit(cache=True, nogil=True)
 def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any) -> None:
-    """What :func:`marl_pack.agents.afterstates.bitboards.judge` says, from masks.
+    """Count the feasible cells of each box from masks of the lowest box on each footprint.
 
     Args:
-        masks, best_level: [K, L · L, W · D], of boxes of the least height on each footprint.
-        lengths, fitting, counts: as there.
+        masks: uint8 [K, L · L, W · D].
+        best_level: integers [K, L · L, W · D], K under the box where the mask is 1.
+        lengths: int64 [L].
+        fitting: int64 [H + 1], see :func:`count_by_masks`.
+        counts: int32 [K, L, L, L], written.
     """
     for k in range(masks.shape[0]):
         counts[k] = 0
@@ -217,83 +227,116 @@ def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any)
                         counts[k, p // lengths.size, p % lengths.size, tall] += 1
 
 
-@njit(cache=True, nogil=True)
-def _chance(counts: Any, ways: Any, chance: Any) -> None:
-    """:meth:`Afterstates.chance` with ``ways`` int64 [O, 3], the orientations' rows."""
-    lengths = counts.shape[1]
-    item = np.empty(3, np.int64)
-    items = lengths**3
-    for k in range(counts.shape[0]):
-        found = 0
-        for i in range(items):
-            item[0], item[1], item[2] = i // lengths**2, i // lengths % lengths, i % lengths
-            for a in range(ways.shape[0]):
-                if counts[k, item[ways[a, 0]], item[ways[a, 1]], item[ways[a, 2]]]:
-                    found += 1
-                    break
-        chance[k] = found / items
+def count_by_masks(
+    heightmaps: Any, empty_maps: Any, lengths: Any, fitting: Any, counts: Any
+) -> None:
+    """Count the cells where each box could be placed on each pair of maps, from masks.
+
+    Args:
+        heightmaps: int16 [K, W, D].
+        empty_maps: int16 [K, W, D].
+        lengths: int64 [L], ascending.
+        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
+        counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
+    """
+    n, *shape = heightmaps.shape
+    height = fitting.size - 1
+    footprints = [(w, d, lengths[0]) for w, d in product(lengths.tolist(), repeat=2)]
+    masks = np.empty((n, len(footprints), *shape), np.uint8)
+    levels = np.empty((n, *shape), hull_compiled.level_dtype(height))
+    best_level = np.empty(masks.shape, levels.dtype)
+    boxes = np.tile(np.array(footprints, np.int16), (n, 1, 1))
+    hull_compiled.central_masks(heightmaps, empty_maps, boxes, height, levels, masks, best_level)
+    flat = n, len(footprints), -1
+    _count(masks.reshape(flat), best_level.reshape(flat), lengths, fitting, counts)
 
 
 @cache
 def _workers(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "room")
+    """Return a pool of worker threads, one pool for each number of threads."""
+    return ThreadPoolExecutor(threads, "afterstates")
 
 
-def _left_cpu(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
+def afterstates_by_compiled_loops(
+    bins: Bins,
+    sides: Tensor,
+    mask: Tensor,
+    lengths: tuple[int, ...],
+    count_cells: Callable[..., None] | None = None,
+) -> Afterstates:
+    """Compute :func:`afterstates_of` in compiled loops.
+
+    Args:
+        bins, sides, mask, lengths: as there.
+        count_cells: :func:`marl_pack.agents.afterstates.bitboards.count_by_bits` or
+            :func:`count_by_masks`; the faster one that the floor permits if None.
+    """
     own, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
+    heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
     index = np.zeros(mask.shape, np.int64)
     placements = _placements(legal, own, index)
-    count, reach, shape = len(placements), np.array(lengths), bins.size[:2]
-    free = bins.height - np.arange(bins.height + 1)
-    fitting = (reach <= free[:, None]).sum(1)
-    heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
+    count, probes, shape = len(placements), np.array(lengths), bins.size[:2]
+    fitting = (probes <= bins.height - np.arange(bins.height + 1)[:, None]).sum(1)
     counts = np.empty((count, *[len(lengths)] * 3), np.int32)
     surface, waste = np.empty((count, SURFACE), np.float32), np.empty(count, np.int64)
-    empty = empty_map.sum((1, 2), dtype=np.int64)[placements[:, 0]]
-    footprints = np.array([(w, d, lengths[0]) for w, d in product(lengths, repeat=2)], np.int16)
-    threads = torch.get_num_threads() if count >= WORTH_A_THREAD else 1
-    small = bitboards.hold(*shape)
-    fit_at_once = AT_ONCE // (shape[0] * shape[1] * (1 if small else len(footprints)))
-    most = max(1, min(-(-count // threads), fit_at_once))
+    by_bits = bitboards.fit_in_words(*shape)
+    if count_cells is None:
+        count_cells = bitboards.count_by_bits if by_bits else count_by_masks
+    threads = torch.get_num_threads() if count >= PER_THREAD else 1
+    masks = 1 if count_cells is bitboards.count_by_bits else len(lengths) ** 2
+    most = max(1, min(-(-count // threads), AT_ONCE // (shape[0] * shape[1] * masks)))
 
-    def judge(start: int) -> None:
+    def compute(start: int) -> None:
         part = slice(start, start + most)
-        some = placements[part]
-        maps = np.empty((2, len(some), *shape), np.int16)
-        _set_down(heightmap, empty_map, own, some, maps[0], maps[1])
-        _describe(maps[0], maps[1], empty[part], bins.height, surface[part], waste[part])
-        if small:
-            bitboards.judge(heightmap, empty_map, own, some, reach, fitting, counts[part])
-        else:
-            _count(*_masks(maps, footprints, bins.height), reach, fitting, counts[part])
+        maps = np.empty((2, len(placements[part]), *shape), np.int16)
+        _place_each(heightmap, empty_map, own, placements[part], maps[0], maps[1], waste[part])
+        _describe(maps[0], bins.height, surface[part])
+        count_cells(maps[0], maps[1], probes, fitting, counts[part])
 
-    if threads == 1:
-        for start in range(0, count, most):
-            judge(start)
-    else:
-        list(_workers(threads).map(judge, range(0, count, most)))
+    starts = range(0, count, most)
+    list(map(compute, starts) if threads == 1 else _workers(threads).map(compute, starts))
     volume = torch.from_numpy(own[placements[:, 0], placements[:, 1]].prod(1, dtype=np.int64))
     return Afterstates(
         torch.from_numpy(index), torch.from_numpy(counts), torch.from_numpy(surface), volume,
-        torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume,
+        torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume, bins.backend,
     )  # fmt: skip
 
 
-def _masks(maps: Any, footprints: Any, height: int) -> tuple[Any, Any]:
-    """Masks uint8 [K, F, W · D] of boxes on the footprints, and the K under them, of maps after."""
-    n, *shape = maps[0].shape
-    masks = np.empty((n, len(footprints), *shape), np.uint8)
-    levels = np.empty((n, *shape), hull_cpu.level_dtype(height))
-    best_level = np.empty(masks.shape, levels.dtype)
-    boxes = np.tile(footprints, (n, 1, 1))
-    hull_cpu.hull_mask(maps[0], maps[1], boxes, height, levels, masks, best_level)
-    return masks.reshape(n, len(footprints), -1), best_level.reshape(n, len(footprints), -1)
+@njit(cache=True, nogil=True)
+def _share_feasible(counts: Any, axes: Any, share: Any) -> None:
+    """Write the share of boxes with a feasible cell in one of the orientations.
+
+    Args:
+        counts: int32 [K, L, L, L].
+        axes: int64 [O, 3], rows of :data:`marl_pack.geometry.ORIENTATIONS`.
+        share: float64 [K], written.
+    """
+    lengths = counts.shape[1]
+    item = np.empty(3, np.int64)
+    items = lengths**3
+    for k in range(counts.shape[0]):
+        feasible = 0
+        for i in range(items):
+            item[0], item[1], item[2] = i // lengths**2, i // lengths % lengths, i % lengths
+            for a in range(axes.shape[0]):
+                if counts[k, item[axes[a, 0]], item[axes[a, 1]], item[axes[a, 2]]]:
+                    feasible += 1
+                    break
+        share[k] = feasible / items
+
+
+def _probability_compiled(counts: Tensor, axes: list[tuple[int, int, int]]) -> Tensor:
+    """Compute the share of boxes with a feasible cell, float64 [K], in compiled loops."""
+    share = np.empty(len(counts))
+    _share_feasible(counts.numpy(), np.array(axes).reshape(-1, 3), share)
+    return torch.from_numpy(share)
 
 
 # --- tensor code ----------------------------------------------------------------------------------
 
 
-def _left_torch(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
+def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
+    """Compute :func:`afterstates_of` in tensor code."""
     width, depth, height = bins.size
     device = bins.device
     boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16, device=device)
@@ -301,34 +344,36 @@ def _left_torch(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...
     index = (mask.flatten().cumsum(0) - 1).clamp(min=0).view(mask.shape)
     at_once = AT_ONCE if device.type == "cpu" else AT_ONCE << 6
     counts, surface, waste = [], [], []
-    for some in torch.split(placements, max(1, at_once // (len(boxes) * width * depth))):
-        b, a, x, y = some.T
-        box = sides[b, a]
-        window = footprint(width, depth, box, x * depth + y)
-        heights = bins.heightmap[b]
-        rest = torch.where(window, heights, 0).flatten(1).amax(1)
-        gap = torch.where(window, rest[:, None, None] - heights, 0)
-        top = (rest + box[:, 2]).to(heights.dtype)
-        after = torch.where(window, top[:, None, None], heights)
-        legal = hull_torch.support_mask(
-            after, (bins.empty_map[b] + gap).to(torch.int16),
-            boxes.expand(len(some), -1, -1).contiguous(), height, None, 0.0,
-        )  # fmt: skip
+    for part in torch.split(placements, max(1, at_once // (len(boxes) * width * depth))):
+        b, a = part[:, 0], part[:, 1]
+        box, heightmap, empty_map = sides[b, a], bins.heightmap[b], bins.empty_map[b]
+        under = footprint(width, depth, box, part[:, 2:])
+        waste.append(place_boxes(heightmap, empty_map, under, box[:, 2])[1])
+        legal = hull_tensor.support_mask(
+            heightmap, empty_map, boxes.expand(len(part), -1, -1).contiguous(), height
+        )
         counts.append(legal.sum((2, 3), dtype=torch.int32))
-        surface.append(_surface(after.long(), height))
-        waste.append(gap.sum((1, 2), dtype=torch.int64))
+        surface.append(_surface(heightmap.long(), height))
     volume = sides[placements[:, 0], placements[:, 1]].long().prod(1)
     return Afterstates(
         index, torch.cat(counts).view(-1, *[len(lengths)] * 3), torch.cat(surface), volume,
-        torch.cat(waste), bins.filled[placements[:, 0]] + volume,
+        torch.cat(waste), bins.filled[placements[:, 0]] + volume, bins.backend,
     )  # fmt: skip
 
 
 def _surface(heights: Tensor, height: int) -> Tensor:
-    """:attr:`Afterstates.surface` of maps int64 [K, W, D]."""
+    """Compute :attr:`Afterstates.surface` of maps int64 [K, W, D]."""
     steps = [heights.diff(dim=axis).abs().flatten(1) for axis in (1, 2)]
     step = (torch.cat(steps, 1) * SHARES // height).clamp(max=STEPS - 1)
     share = (heights * SHARES // height).flatten(1)
     kinds = torch.arange(max(SHARES + 1, STEPS), device=heights.device)[:, None, None]
     shares = (share == kinds[: SHARES + 1]).sum(2).T / share.shape[1]
     return torch.cat((shares, (step == kinds[:STEPS]).sum(2).T / max(1, step.shape[1])), 1)
+
+
+def _probability_tensor(counts: Tensor, axes: list[tuple[int, int, int]]) -> Tensor:
+    """Compute the share of boxes with a feasible cell, float32 [K], in tensor code."""
+    feasible = counts > 0
+    inverse = [sorted(range(3), key=row.__getitem__) for row in axes]
+    rotated = [feasible.permute(0, *(1 + axis for axis in own)) for own in inverse]
+    return torch.stack(rotated).any(0).flatten(1).float().mean(1)

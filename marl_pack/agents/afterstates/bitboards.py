@@ -1,10 +1,11 @@
-"""What placements leave on floors of at most 128 cells: sets of cells as the bits of two words.
+"""Feasible cells on floors of at most 128 cells: sets of cells as the bits of two words.
 
-Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit moved by whole numbers,
-and the corners of all windows that hold a cell of a set are that set moved and united. What makes
-``hull_alpha`` fast on maps (:mod:`marl_pack.stability.hull_cpu`) is said here of sets: level by
-level, the windows without anything higher in which each quadrant around the middle, or only each
-half, holds a bearing cell of that level. Corners whose windows reach over a row's end are left out.
+Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit shifted by whole numbers,
+and the corners of all windows that hold a cell of a set are the union of that set's shifts. The
+quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compiled`) is computed here on sets:
+level by level, the windows without anything higher in which each quadrant around the middle, or
+only each half, holds a bearing cell of that level. Corners whose windows reach over a row's end are
+left out.
 """
 
 from __future__ import annotations
@@ -15,18 +16,19 @@ import numpy as np
 from numba import njit, uint64
 
 MOST_CELLS = 128
+"""Number of bits of two words."""
 STEEPEST = 1e6
-"""More than any rise to a corner that is not right above."""
+"""A rise larger than any to a corner that is not right above."""
 
 
-def hold(width: int, depth: int) -> bool:
-    """Whether a floor's cells are bits of two words, and those of a row of one."""
+def fit_in_words(width: int, depth: int) -> bool:
+    """Return whether a floor's cells fit into two words, and those of a row into one."""
     return width * depth <= MOST_CELLS and depth <= MOST_CELLS // 2
 
 
 @njit(cache=True, inline="always")
 def _later(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
-    """The set moved down by 0 … 127 bits: bit i of the result is bit i + ``bits`` of the set."""
+    """Shift a set down by 0 … 127 bits: bit i of the result is bit i + ``bits`` of the set."""
     if bits >= 64:
         return high >> uint64(bits - 64), uint64(0)
     if bits == 0:
@@ -36,7 +38,7 @@ def _later(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
 
 @njit(cache=True, inline="always")
 def _size(word: Any) -> int:
-    """How many bits of a word are 1."""
+    """Return how many bits of a word are 1."""
     word = word - ((word >> uint64(1)) & uint64(0x5555555555555555))
     word = (word & uint64(0x3333333333333333)) + ((word >> uint64(2)) & uint64(0x3333333333333333))
     word = (word + (word >> uint64(4))) & uint64(0x0F0F0F0F0F0F0F0F)
@@ -45,7 +47,7 @@ def _size(word: Any) -> int:
 
 @njit(cache=True)
 def _window(depth: int, x: int, y: int, w: int, d: int) -> tuple[Any, Any]:
-    """The cells from (x, y) on to x + w - 1, y + d - 1."""
+    """Return the set of the cells from (x, y) to (x + w - 1, y + d - 1)."""
     low, high = uint64(0), uint64(0)
     for i in range(x, x + w):
         for j in range(y, y + d):
@@ -59,7 +61,7 @@ def _window(depth: int, x: int, y: int, w: int, d: int) -> tuple[Any, Any]:
 
 @njit(cache=True, inline="always")
 def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
-    """Unite ``grown`` [2] with ``source`` [2] moved down by ``first`` … ``end`` - 1 strides."""
+    """Unite ``grown`` [2] with ``source`` [2] shifted by ``first`` … ``end`` - 1 strides."""
     for step in range(first, end):
         low, high = _later(source[0], source[1], step * stride)
         grown[0] |= low
@@ -68,7 +70,7 @@ def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
 
 @njit(cache=True)
 def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
-    """Corners of the windows of every size up to R × S that hold one of ``cells``.
+    """Find the corners of the windows of every size up to R × S that hold one of ``cells``.
 
     Args:
         cells: uint64 [2], a set.
@@ -88,13 +90,13 @@ def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
 
 @njit(cache=True, inline="always")
 def _first(word: Any) -> int:
-    """The lowest bit that is 1."""
+    """Return the lowest bit that is 1."""
     return _size((word & (~word + uint64(1))) - uint64(1))
 
 
 @njit(cache=True, inline="always")
 def _last(word: Any) -> int:
-    """The highest bit that is 1."""
+    """Return the highest bit that is 1."""
     for step in (1, 2, 4, 8, 16, 32):
         word |= word >> uint64(step)
     return _size(word) - 1
@@ -102,9 +104,9 @@ def _last(word: Any) -> int:
 
 @njit(cache=True)
 def _rises(w: int, d: int, rises: Any) -> None:
-    """How steeply the hull rises from a window's middle to each of its cells.
+    """Compute how steeply the hull rises from a window's middle to each of its cells.
 
-    The middle is inside the hull of cells if above it, and likewise below, the steepest rise to a
+    The middle is inside the hull of cells if, both above and below it, the steepest rise to a
     corner on its left and the steepest to one on its right add up to more than 0. A corner right
     above counts as the steepest of its cell's side.
 
@@ -127,20 +129,20 @@ def _rises(w: int, d: int, rises: Any) -> None:
 
 @njit(cache=True)
 def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> tuple[Any, Any]:
-    """Of the windows with these ``corners`` [2] those whose middle ``cells`` [2] hold up."""
-    found_low, found_high = uint64(0), uint64(0)
+    """Return the set of those of ``corners`` [2] whose windows' middle is in the hull of cells."""
+    inside_low, inside_high = uint64(0), uint64(0)
     row = ~uint64(0) >> uint64(64 - d)
     for word in range(2):
-        left = corners[word]
-        while left:
-            lowest = left & (~left + uint64(1))
-            left ^= lowest
+        remaining = corners[word]
+        while remaining:
+            lowest = remaining & (~remaining + uint64(1))
+            remaining ^= lowest
             corner = 64 * word + _size(lowest - uint64(1))
             up_left, up_right, down_left, down_right = -np.inf, -np.inf, -np.inf, -np.inf
             for x in range(w):
-                held = _later(cells[0], cells[1], corner + x * depth)[0] & row
-                if held:
-                    top, bottom = _last(held), d - 1 - _first(held)
+                bits = _later(cells[0], cells[1], corner + x * depth)[0] & row
+                if bits:
+                    top, bottom = _last(bits), d - 1 - _first(bits)
                     up_left = max(up_left, rises[x, top, 0])
                     up_right = max(up_right, rises[x, top, 1])
                     down_left = max(down_left, rises[x, bottom, 0])
@@ -148,62 +150,80 @@ def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> 
             # Rises are fractions of whole numbers up to 128: their sums are 0 or well off it.
             if up_left + up_right > 1e-6 and down_left + down_right > 1e-6:
                 if word == 0:
-                    found_low |= lowest
+                    inside_low |= lowest
                 else:
-                    found_high |= lowest
-    return found_low, found_high
+                    inside_high |= lowest
+    return inside_low, inside_high
 
 
-@njit(cache=True, nogil=True)
-def judge(
-    heightmap: Any, hollow: Any, sides: Any, placements: Any, lengths: Any, fitting: Any,
-    counts: Any,
-) -> None:  # fmt: skip
-    """In how many cells each box that may come could be set down after each placement.
+@njit(cache=True)
+def _window_tables(lengths: Any, width: int, depth: int) -> tuple[Any, Any]:
+    """Build what depends only on a window's size, for the lengths that fit on the floor.
 
-    Args:
-        heightmap, hollow: int16 [N, W, D], of a floor that :func:`hold` says yes to.
-        sides: int16 [N, A, 3].
-        placements: int64 [K, 4], bin, orientation and cell, legal; those of a bin in one piece.
-        lengths: int64 [L], ascending.
-        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
-        counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
+    Returns:
+        The corners of the windows that lie on the floor, uint64 [I, J, 2], and the rises in them
+        (:func:`_rises`), float64 [I, J, W, D, 2].
     """
-    width, depth = heightmap.shape[1:]
-    count, most = lengths.size, fitting.size
     fit_w, fit_d = int((lengths <= width).sum()), int((lengths <= depth).sum())
-    valid = np.zeros((count, count, 2), np.uint64)
+    valid = np.zeros((fit_w, fit_d, 2), np.uint64)
+    rises = np.empty((fit_w, fit_d, width, depth, 2))
     for i in range(fit_w):
         for j in range(fit_d):
             across, along = width - lengths[i] + 1, depth - lengths[j] + 1
             valid[i, j, 0], valid[i, j, 1] = _window(depth, 0, 0, across, along)
+            _rises(lengths[i], lengths[j], rises[i, j])
+    return valid, rises
+
+
+@njit(cache=True)
+def _levels(heightmap: Any, empty_map: Any, levels: Any) -> None:
+    """Write the bearing cells and all cells of each level, uint64 [H + 1, 2, 2], of maps [W, D]."""
+    depth = heightmap.shape[1]
+    levels[:] = uint64(0)
+    for i in range(heightmap.shape[0]):
+        for j in range(depth):
+            bit, level = i * depth + j, heightmap[i, j]
+            one = uint64(1) << uint64(bit & 63)
+            levels[level, 1, bit >> 6] |= one
+            if empty_map[i, j] == 0:
+                levels[level, 0, bit >> 6] |= one
+
+
+@njit(cache=True, inline="always")
+def _decide_word(free: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
+    """Decide windows from the cells in their quadrants: ``a b`` low in x, ``a c`` low in y.
+
+    Returns:
+        The free corners with a cell in all four quadrants, and the other free corners with a cell
+        in each half, which the exact test must decide.
+    """
+    yes = free & a & b & c & d
+    return yes, free & ~yes & (a | b) & (c | d) & (a | c) & (b | d)
+
+
+@njit(cache=True, nogil=True)
+def count_by_bits(
+    heightmaps: Any, empty_maps: Any, lengths: Any, fitting: Any, counts: Any
+) -> None:
+    """Count as ``count_by_masks`` does, on floors for which :func:`fit_in_words` is true."""
+    (width, depth), most = heightmaps.shape[1:], fitting.size
+    valid, rises = _window_tables(lengths, width, depth)
+    fit_w, fit_d = valid.shape[:2]
     reach_w = (lengths[fit_w - 1] + 1) // 2 if fit_w else 0
     reach_d = (lengths[fit_d - 1] + 1) // 2 if fit_d else 0
-    own = np.empty((most, 2, 2), np.uint64)  # of each level: bearing cells, all cells
-    after = np.empty((most, 2, 2), np.uint64)
+    levels = np.empty((most, 2, 2), np.uint64)  # of each level: bearing cells, all cells
     quarters = np.empty((reach_w + 1, reach_d + 1, 2), np.uint64)
-    above = np.empty(2, np.uint64)
-    deep = np.empty((count, 2), np.uint64)  # corners below which something is higher, in a row
-    blocked = np.empty((count, 2), np.uint64)  # and in all rows so far
-    undecided = np.empty(2, np.uint64)
-    rises = np.empty((fit_w, fit_d, width, depth, 2))
-    for i in range(fit_w):
-        for j in range(fit_d):
-            _rises(lengths[i], lengths[j], rises[i, j])
-    shown = -1
-    for k in range(placements.shape[0]):
-        b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
-        if b != shown:
-            shown = b
-            _levels(heightmap[b], hollow[b], own)
-        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
-        _set_down(own, _window(depth, x, y, w, d), h, after)
+    above, undecided = np.empty(2, np.uint64), np.empty(2, np.uint64)
+    deep = np.empty((fit_d, 2), np.uint64)  # corners below which something is higher, in a row
+    blocked = np.empty((fit_d, 2), np.uint64)  # and in all rows so far
+    for k in range(heightmaps.shape[0]):
+        _levels(heightmaps[k], empty_maps[k], levels)
         counts[k] = 0
         above[:] = uint64(0)
         for level in range(most - 1, -1, -1):
             fit = fitting[level]
-            if fit and fit_w and fit_d and (after[level, 0, 0] | after[level, 0, 1]):
-                _corners(after[level, 0], depth, undecided, quarters)
+            if fit and fit_w and fit_d and (levels[level, 0, 0] | levels[level, 0, 1]):
+                _corners(levels[level, 0], depth, undecided, quarters)
                 deep[0] = above
                 for j in range(fit_d):
                     if j:
@@ -219,7 +239,7 @@ def judge(
                         free_low = valid[i, j, 0] & ~blocked[j, 0]
                         free_high = valid[i, j, 1] & ~blocked[j, 1]
                         if not (free_low | free_high):
-                            last = j  # nor has anything longer a place on this level
+                            last = j  # nothing longer has a free window on this level either
                             break
                         half_d = (lengths[j] + 1) // 2
                         along = lengths[j] - half_d
@@ -227,55 +247,16 @@ def judge(
                         b_low, b_high = _later(a_low, a_high, along)
                         c_low, c_high = _later(a_low, a_high, across)
                         d_low, d_high = _later(a_low, a_high, across + along)
-                        yes_low = free_low & a_low & b_low & c_low & d_low
-                        yes_high = free_high & a_high & b_high & c_high & d_high
-                        undecided[0] = free_low & ~yes_low & (a_low | b_low) & (c_low | d_low) & (
-                            a_low | c_low
-                        ) & (b_low | d_low)  # fmt: skip
-                        undecided[1] = free_high & ~yes_high & (a_high | b_high) & (
-                            c_high | d_high
-                        ) & (a_high | c_high) & (b_high | d_high)  # fmt: skip
+                        low, undecided[0] = _decide_word(free_low, a_low, b_low, c_low, d_low)
+                        high, undecided[1] = _decide_word(free_high, a_high, b_high, c_high, d_high)
                         if undecided[0] | undecided[1]:
                             more_low, more_high = _exact(
-                                after[level, 0], undecided, depth, lengths[i], lengths[j],
+                                levels[level, 0], undecided, depth, lengths[i], lengths[j],
                                 rises[i, j],
                             )  # fmt: skip
-                            yes_low, yes_high = yes_low | more_low, yes_high | more_high
-                        if yes_low | yes_high:
-                            found = _size(yes_low) + _size(yes_high)
-                            for tall in range(fit):
-                                counts[k, i, j, tall] += found
-            above[0] |= after[level, 1, 0]
-            above[1] |= after[level, 1, 1]
-
-
-@njit(cache=True)
-def _levels(heights: Any, hollow: Any, own: Any) -> None:
-    """Bearing and all cells of each level, uint64 [H + 1, 2, 2], of maps [W, D]."""
-    depth = heights.shape[1]
-    own[:] = uint64(0)
-    for i in range(heights.shape[0]):
-        for j in range(depth):
-            bit, level = i * depth + j, heights[i, j]
-            one = uint64(1) << uint64(bit & 63)
-            own[level, 1, bit >> 6] |= one
-            if hollow[i, j] == 0:
-                own[level, 0, bit >> 6] |= one
-
-
-@njit(cache=True, inline="always")
-def _set_down(own: Any, under: Any, h: int, after: Any) -> None:
-    """The levels after a box of height ``h`` has been set down on the cells ``under``."""
-    low, high = under
-    rest = 0
-    for level in range(own.shape[0]):
-        if (own[level, 1, 0] & low) | (own[level, 1, 1] & high):
-            rest = level
-        for which in range(2):
-            after[level, which, 0] = own[level, which, 0] & ~low
-            after[level, which, 1] = own[level, which, 1] & ~high
-    # What rests on a bearing cell bears.
-    after[rest + h, 0, 0] |= own[rest, 0, 0] & low
-    after[rest + h, 0, 1] |= own[rest, 0, 1] & high
-    after[rest + h, 1, 0] |= low
-    after[rest + h, 1, 1] |= high
+                            low, high = low | more_low, high | more_high
+                        feasible = _size(low) + _size(high)
+                        for tall in range(fit if feasible else 0):
+                            counts[k, i, j, tall] += feasible
+            above[0] |= levels[level, 1, 0]
+            above[1] |= levels[level, 1, 1]

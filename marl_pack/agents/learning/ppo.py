@@ -1,16 +1,16 @@
-"""PPO for two agents that take turns: one stock rsl_rl ``PPO`` each, driven as if they were one.
+"""PPO for agents that take turns: one stock rsl_rl ``PPO`` each, driven as if they were one.
 
-Within a step the orientation agent acts on what it sees, then the placement agent on what that
-choice shows it. Both store the same reward and the same end of episode (Eq. 3 – 5), each reckons
-its advantages over its own turns. A frozen agent plays without learning. One that imitates plays as
-another does, one choice in ten at random, and learns to play so: all have the same advantage.
+Within a step the orientation agent acts on what it observes, then the placement agent on what that
+choice shows it. Both store the same reward and the same end of episode (Eq. 3 – 5), each computes
+its advantages over its own turns. A frozen agent plays without learning. An agent that clones a
+teacher plays as the teacher does and learns to: all its choices have the same advantage.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -20,130 +20,147 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from marl_pack.agents import joint
-from marl_pack.agents.afterstates.critic import AfterstateLearner
-from marl_pack.agents.heuristics import make_placement_agent
-from marl_pack.agents.learning import checkpoint
-from marl_pack.agents.learning.symmetry import see_through_symmetries
+from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.learning.cloning import Teacher
+from marl_pack.agents.learning.symmetry import mirror_rollout
 from marl_pack.agents.networks.actor_critic import Actor, Critic
-from marl_pack.agents.policy import OrientationAgent, PlacementAgent, draw
-from marl_pack.game.packing import Packing, orientations_with_a_cell
+from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
+from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
-RANDOM_SHARE = 0.1  # of the choices of an agent that imitates, so that it does not grow too sure
-RANDOM: Mapping[str, Callable[..., Tensor]] = {
-    "orientation": lambda game: draw(orientations_with_a_cell(game.mask)),
-    "placement": make_placement_agent("random", None),
-}
 KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
 
 
-@dataclass(frozen=True)
-class Imitation:
-    """Whom a learner imitates for how many iterations.
+@dataclass
+class Seat:
+    """One agent's place in a step: a learner with its PPO, or an agent that is frozen.
 
-    Orientation agents both, or placement agents.
+    Args:
+        kind: of the agent.
+        ppo: of a learner; None where ``frozen`` plays.
+        frozen: the games and what was chosen before → actions int64 [G].
+        planes: extra planes that a learner observes.
+        schedule: a learner's settings for :meth:`anneal`, and ``symmetry``.
+        teacher: whose choices a learner clones at first.
     """
 
-    model: Callable[..., Tensor]
-    random: Callable[..., Tensor]
-    iterations: int
+    kind: AgentKind
+    ppo: PPO | None = None
+    frozen: Callable[..., Tensor] | None = None
+    planes: Sequence[str] = ()
+    schedule: Mapping[str, Any] | None = None
+    teacher: Teacher | None = None
 
-    def __call__(self, game: Packing, *before: Tensor) -> Tensor:
-        """The model's choices, int64 [N], or random ones in their place here and there."""
-        chosen = self.model(game, *before)
-        other = torch.rand(len(chosen), device=chosen.device) < RANDOM_SHARE
-        return torch.where(other, self.random(game, *before), chosen)
+    def teacher_at(self, iteration: int) -> Teacher | None:
+        """Return the teacher that the learner clones in an iteration, if it does."""
+        teacher = self.teacher
+        return teacher if teacher and iteration < teacher.iterations else None
+
+    def act(self, observation: TensorDict, game: Packing, before: Choice, iteration: int) -> Tensor:
+        """Return the actions int64 [G]; a learner's are recorded as its own."""
+        if self.ppo is None:
+            return self._play_frozen(game, before)
+        action = self.ppo.act(observation)
+        teacher = self.teacher_at(iteration)
+        if teacher is None:
+            return action.squeeze(1).long()
+        chosen = teacher(game, *before)
+        taken = chosen.unsqueeze(1).to(action.dtype)
+        self.ppo.transition.actions = taken
+        self.ppo.transition.actions_log_prob = self.ppo.actor.get_output_log_prob(taken).detach()
+        return chosen
+
+    def draw(
+        self, observation: TensorDict, game: Packing, before: Choice, iteration: int
+    ) -> Tensor:
+        """Return actions int64 [G] as :meth:`act` would, without recording them."""
+        if self.ppo is None:
+            return self._play_frozen(game, before)
+        teacher = self.teacher_at(iteration)
+        if teacher is not None:
+            return teacher(game, *before)
+        return self.ppo.actor(observation, stochastic_output=True).squeeze(1).long()
+
+    def _play_frozen(self, game: Packing, before: Choice) -> Tensor:
+        assert self.frozen is not None, "an agent that does not learn is frozen"
+        return self.frozen(game, *before)
+
+    def anneal(self, progress: float) -> None:
+        """Set learning rate and entropy bonus for a share of the run that is done, 0 … 1."""
+        assert self.ppo is not None, "only learners have a schedule"
+        assert self.schedule is not None, "a learner has one"
+        first, last = self.schedule["entropy_coef"], self.schedule["final_entropy_coef"]
+        self.ppo.entropy_coef = first + progress * (last - first)
+        if self.schedule["schedule"] == "linear":
+            self.ppo.learning_rate = self.schedule["learning_rate"] * (1 - progress)
+            for group in self.ppo.optimizer.param_groups:
+                group["lr"] = self.ppo.learning_rate
 
 
 class PackingPPO:
-    """What rsl_rl's ``OnPolicyRunner`` takes for a PPO.
+    """What rsl_rl's ``OnPolicyRunner`` takes for a PPO; the run's owner of the afterstate critic.
 
     Args:
-        learners: name (``orientation``, ``placement`` or ``joint``) → the agent's PPO.
-        orientation_agent: who orients where no learner does.
-        placement_agent: who places where no learner does.
-        env: the bins.
-        schedules: name → settings of :meth:`anneal` for that learner.
+        seats: the agents, in the order of their turns.
+        env: the games.
+        lookahead: what placements leave, and its value; shared by all learners.
         iterations: how many there will be, for the schedules.
-        afterstates: who teaches the critic that says what placements are worth, if agents see it.
-        imitations: name → whom that learner imitates at first; nobody where there is none.
+        afterstates: which teaches the critic of afterstates, if agents see its values.
+
+    Raises:
+        ValueError: if no agent learns.
     """
 
     rnd = None  # no exploration bonus; the runner asks
 
     def __init__(
         self,
-        learners: Mapping[str, PPO],
-        orientation_agent: OrientationAgent | None,
-        placement_agent: PlacementAgent | None,
+        seats: Sequence[Seat],
         env: PackingVecEnv,
-        schedules: Mapping[str, Mapping[str, Any]],
+        lookahead: Lookahead,
         iterations: int,
         afterstates: AfterstateLearner | None = None,
-        imitations: Mapping[str, Imitation] | None = None,
     ) -> None:
-        if not learners:
+        self.seats = list(seats)
+        self.learners = {seat.kind.name: seat.ppo for seat in self.seats if seat.ppo is not None}
+        if not self.learners:
             raise ValueError("both agents are frozen: nothing would learn")
-        self.learners = dict(learners)
-        self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
-        self.env = env
-        self.schedules = schedules
-        self.iterations = iterations
-        self.iteration = 0
+        self.env, self.lookahead = env, lookahead
+        self.iterations, self.iteration = iterations, 0
         self.afterstates = afterstates
-        self.imitations = dict(imitations or {})
-        self._last: TensorDict | None = None  # what is seen after the rollout
+        self._last: TensorDict | None = None  # the observation after the rollout
+
+    @property
+    def _learning(self) -> list[Seat]:
+        return [seat for seat in self.seats if seat.ppo is not None]
 
     # --- the rollout ------------------------------------------------------------------------------
 
+    def _observation(self, seat: Seat, before: Choice, first: TensorDict) -> TensorDict:
+        """Return what an agent observes at its turn: in the first turn ``first``."""
+        if not before or seat.ppo is None:
+            return first
+        game = self.env.game
+        observation = observe(seat.kind.name, game, seat.planes, self.lookahead, *before)
+        return TensorDict(observation, batch_size=[game.n], device=game.device)
+
     def act(self, obs: TensorDict) -> Tensor:
-        """Both agents' choices, int64 [N, 2]; the learners' are recorded.
+        """Return all agents' choices, int64 [G, 2]: orientation and cell; record the learners'.
 
         Args:
-            obs: what the environment's ``get_observations`` gave.
+            obs: as the environment's ``get_observations`` returns it.
         """
-        chosen = self._choose(obs)
+        game = self.env.game
+        choice: Choice = ()
+        for seat in self.seats:
+            observation = self._observation(seat, choice, obs)
+            action = seat.act(observation, game, choice, self.iteration)
+            choice = seat.kind.extend(choice, action, game.floor)
         if self.afterstates is not None:
-            self.afterstates.record(self.env.game, chosen[:, 0], chosen[:, 1])
-        return chosen
-
-    def _choose(self, obs: TensorDict) -> Tensor:
-        if "joint" in self.learners:
-            pair = self.learners["joint"].act(obs).squeeze(1).long()
-            return torch.stack(joint.split(pair, obs["heightmap"][0].numel()), 1)
-        if "orientation" in self.learners:
-            orientation = self._turn("orientation", obs)
-        else:
-            orientation = self._frozen_orientation()
-        if "placement" in self.learners:
-            cell = self._turn("placement", self.env.orient(orientation), orientation)
-        else:
-            assert self.placement_agent is not None
-            cell = self.placement_agent(self.env.game, orientation)
-        return torch.stack((orientation, cell), 1)
-
-    def _turn(self, name: str, seen: TensorDict, *before: Tensor) -> Tensor:
-        """A learner's choice, int64 [N], or that of whom it imitates, recorded as its own."""
-        ppo = self.learners[name]
-        action = ppo.act(seen)
-        imitated = self.imitated(name)
-        if imitated is None:
-            return action.squeeze(1).long()
-        chosen = imitated(self.env.game, *before)
-        taken = chosen.unsqueeze(1).to(action.dtype)
-        ppo.transition.actions = taken
-        ppo.transition.actions_log_prob = ppo.actor.get_output_log_prob(taken).detach()
-        return chosen
-
-    def imitated(self, name: str) -> Imitation | None:
-        """Whom the learner imitates in this iteration."""
-        imitation = self.imitations.get(name)
-        return imitation if imitation and self.iteration < imitation.iterations else None
-
-    def _frozen_orientation(self) -> Tensor:
-        assert self.orientation_agent is not None
-        return self.orientation_agent(self.env.game)
+            orientation, cell = choice
+            self.afterstates.record(game, orientation, cell)
+        return torch.stack(choice, 1)
 
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
@@ -153,79 +170,75 @@ class PackingPPO:
             ppo.process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Advantages of the rollout that ends at ``obs``; there an orientation is drawn."""
+        """Compute the advantages of the rollout that ends at ``obs``.
+
+        The value of what follows is each agent's at its next turn; the choices before that turn are
+        drawn.
+        """
         self._last = obs
-        for name, ppo in self.learners.items():
-            if name != "placement":
-                ppo.compute_returns(obs)
-                continue
-            imitated = self.imitated("orientation")
-            if imitated is not None:
-                orientation = imitated(self.env.game)
-            elif "orientation" in self.learners:
-                actor = self.learners["orientation"].actor
-                orientation = actor(obs, stochastic_output=True).squeeze(1).long()
-            else:
-                orientation = self._frozen_orientation()
-            ppo.compute_returns(self.env.orient(orientation))
-        for name, ppo in self.learners.items():
-            if self.imitated(name) is not None:
-                ppo.storage.advantages = torch.ones_like(ppo.storage.advantages)
+        game = self.env.game
+        choice: Choice = ()
+        remaining = len(self._learning)
+        for seat in self.seats:
+            observation = self._observation(seat, choice, obs)
+            if seat.ppo is not None:
+                seat.ppo.compute_returns(observation)
+                remaining -= 1
+                if seat.teacher_at(self.iteration) is not None:
+                    storage = seat.ppo.storage
+                    storage.advantages = torch.ones_like(storage.advantages)
+            if not remaining:
+                break
+            action = seat.draw(observation, game, choice, self.iteration)
+            choice = seat.kind.extend(choice, action, game.floor)
 
     # --- the update -------------------------------------------------------------------------------
 
     def update(self) -> dict[str, float]:
-        """One PPO update of each learner.
+        """Run one PPO update of each learner.
 
         Returns:
             For each learner ``name/value``, ``name/surrogate``, ``name/entropy`` (means over the
             minibatches), ``name/kl`` (old to new policy, after the update), ``name/learning_rate``;
-            and ``afterstates``, the squared error of what placements were thought worth.
+            and ``afterstates``, the squared error of the critic of afterstates.
         """
         losses: dict[str, float] = {}
-        for name in self.learners:
-            self.anneal(name)
+        progress = min(1.0, self.iteration / max(1, self.iterations))
+        for seat in self._learning:
+            seat.anneal(progress)
         if self.afterstates is not None:
             losses["afterstates"] = self._learn_afterstates(self.afterstates)
-        for name, ppo in self.learners.items():
-            if self.schedules[name]["symmetry"]:
-                see_through_symmetries(ppo, name)
+        for seat in self._learning:
+            name, ppo = seat.kind.name, seat.ppo
+            assert ppo is not None, "it learns"
+            assert seat.schedule is not None, "a learner has one"
+            if seat.schedule["symmetry"]:
+                mirror_rollout(ppo, name)
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
             losses[f"{name}/kl"] = self._divergence(ppo)
             losses[f"{name}/learning_rate"] = ppo.learning_rate
         self.iteration += 1
-        if self.afterstates is not None:
-            assert self._last is not None
-            self.env.look_again(self._last)
+        if self.afterstates is not None and self._last is not None:
+            with torch.inference_mode():  # what was observed before the critic learned
+                self._last.update_(self.env.get_observations())
         return losses
 
     def _learn_afterstates(self, learner: AfterstateLearner) -> float:
-        """Teach the critic of afterstates what the first learner's placements have brought."""
+        """Teach the critic of afterstates by the returns of the first learner's placements."""
         ppo = next(iter(self.learners.values()))
         processes = ppo.gpu_world_size if ppo.is_multi_gpu else 1
         storage = ppo.storage
         return learner.learn(storage.returns, storage.rewards, ppo.learning_rate, processes)
 
-    def anneal(self, name: str) -> None:
-        """Set learning rate and entropy bonus as this iteration's share of the run says."""
-        ppo, schedule = self.learners[name], self.schedules[name]
-        done = min(1.0, self.iteration / max(1, self.iterations))
-        first, last = schedule["entropy_coef"], schedule["final_entropy_coef"]
-        ppo.entropy_coef = first + done * (last - first)
-        if schedule["schedule"] == "linear":
-            ppo.learning_rate = schedule["learning_rate"] * (1 - done)
-            for group in ppo.optimizer.param_groups:
-                group["lr"] = ppo.learning_rate
-
     @staticmethod
     def _divergence(ppo: PPO) -> float:
-        """Mean KL(old || new) over states of the last rollout, spread evenly through it."""
+        """Average KL(old || new) over states of the last rollout, spread evenly through it."""
         storage = ppo.storage
         total = storage.num_envs * storage.num_transitions_per_env
-        chosen = torch.arange(0, total, -(-total // KL_SAMPLES), device=storage.device)
+        sample = torch.arange(0, total, -(-total // KL_SAMPLES), device=storage.device)
         with torch.inference_mode():
-            ppo.actor(storage.observations.flatten(0, 1)[chosen], stochastic_output=True)
-            old = tuple(p.flatten(0, 1)[chosen] for p in storage.distribution_params)
+            ppo.actor(storage.observations.flatten(0, 1)[sample], stochastic_output=True)
+            old = tuple(p.flatten(0, 1)[sample] for p in storage.distribution_params)
             new = ppo.actor.output_distribution_params
             return float(ppo.actor.get_kl_divergence(old, new).mean())
 
@@ -242,16 +255,16 @@ class PackingPPO:
         return torch.cat([ppo.actor.output_std for ppo in self.learners.values()])
 
     def get_policy(self) -> PackingPPO:
-        """Itself: there is more than one actor."""
+        """Return itself: there is more than one actor."""
         return self
 
     def train_mode(self) -> None:
-        """All networks to training mode."""
+        """Set all networks to training mode."""
         for ppo in self.learners.values():
             ppo.train_mode()
 
     def eval_mode(self) -> None:
-        """All networks to evaluation mode."""
+        """Set all networks to evaluation mode."""
         for ppo in self.learners.values():
             ppo.eval_mode()
 
@@ -259,29 +272,39 @@ class PackingPPO:
         """Give all processes the first one's weights."""
         for ppo in self.learners.values():
             ppo.broadcast_parameters()
+        if self.afterstates is not None:
+            for weight in self.afterstates.critic.state_dict().values():
+                torch.distributed.broadcast(weight, src=0)
 
     def save(self) -> dict[str, Any]:
-        """Stock states of the learners' PPOs, by name, and the place in the schedules."""
-        kept: dict[str, Any] = {
+        """Return the stock states of the learners' PPOs, by name, and what else the run owns."""
+        state: dict[str, Any] = {
             "learners": {name: ppo.save() for name, ppo in self.learners.items()},
             "schedule_iteration": self.iteration,
         }
         if self.afterstates is not None:
-            kept["afterstates"] = self.afterstates.optimizer.state_dict()
-        return kept
+            state["afterstate_critic"] = self.afterstates.critic.state_dict()
+            state["afterstate_optimizer"] = self.afterstates.optimizer.state_dict()
+        return state
 
     def load(
         self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool
     ) -> bool:
-        """Load what :meth:`save` gave; returns whether the iteration is to be loaded too."""
-        wanted = True
+        """Load what :meth:`save` returned; return whether the iteration is to be loaded too."""
+        load_iteration = True
         for name, ppo in self.learners.items():
-            wanted = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
+            load_iteration = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
         self.iteration = loaded_dict["schedule_iteration"]
         if self.afterstates is not None:
-            self.afterstates.optimizer.load_state_dict(loaded_dict["afterstates"])
-            self.env.game.forget(self.afterstates.critic)
-        return wanted
+            self.load_afterstate_critic(loaded_dict["afterstate_critic"])
+            self.afterstates.optimizer.load_state_dict(loaded_dict["afterstate_optimizer"])
+        return load_iteration
+
+    def load_afterstate_critic(self, weights: Mapping[str, Tensor]) -> None:
+        """Load weights of the critic of afterstates, if agents see its values."""
+        if self.afterstates is not None:
+            self.afterstates.critic.load_state_dict(weights)
+            self.lookahead.forget_values()
 
     @staticmethod
     def construct_algorithm(
@@ -291,44 +314,44 @@ class PackingPPO:
 
         Args:
             obs: an observation.
-            env: the bins.
-            cfg: ``algorithm`` with ``iterations``; ``agents``: for each agent either ``frozen``
-                (what a checkpoint keeps of it) or ``network``, ``algorithm`` (rsl_rl's PPO),
-                ``schedule``, ``symmetry`` and, if it imitates, ``imitated`` (as ``frozen``) and
-                ``imitate_iterations``.
+            env: the games.
+            cfg: ``algorithm`` with ``iterations``, ``lookahead``, and ``frozen`` and ``teachers``:
+                agents by name, callables as :class:`Seat` takes them; ``agents``: for each learner
+                ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule``, ``symmetry`` and
+                ``teacher_iterations``.
             device: of the networks.
         """
-        rebuild: dict[str, Callable[..., Any]] = {
-            "orientation": checkpoint.orientation_agent, "placement": checkpoint.placement_agent,
-        }  # fmt: skip
-        learners, schedules = {}, {}
-        frozen: dict[str, Any] = {}
-        imitations = {}
+        own = cfg["algorithm"]
+        lookahead: Lookahead = own.pop("lookahead")
+        frozen, teachers = own.pop("frozen"), own.pop("teachers")
+        seats = []
         for name, settings in cfg["agents"].items():
-            if settings.get("frozen"):
-                frozen[name] = settings["frozen"]
+            kind = AGENT_KINDS[name]
+            if name in frozen:
+                seats.append(Seat(kind, frozen=frozen[name]))
                 continue
-            seen = obs
-            if name == "placement":
-                seen = env.orient(torch.zeros(env.num_envs, dtype=torch.int64, device=env.device))
-            learners[name] = _stock_ppo(name, settings, seen, env, cfg, device)
-            schedules[name] = {**settings["schedule"], "symmetry": settings["symmetry"]}
-            if settings.get("imitated"):
-                model = rebuild[name]({"agents": {name: settings["imitated"]}}, device, None)
-                imitations[name] = Imitation(model, RANDOM[name], settings["imitate_iterations"])
-        orientation_agent = placement_agent = None
-        if "orientation" in frozen:
-            orientation_agent = rebuild["orientation"]({"agents": frozen}, device, None)
-        if "placement" in frozen:
-            placement_agent = rebuild["placement"]({"agents": frozen}, device, None)
-        iterations = cfg["algorithm"]["iterations"]
+            planes = settings["network"]["planes"]
+            zeros = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
+            before = (zeros,) if seats else ()
+            example = observe(name, env.game, planes, lookahead, *before)
+            example = TensorDict(example, batch_size=[env.num_envs], device=env.device)
+            teacher = None
+            if name in teachers:
+                teacher = Teacher(kind, teachers[name], settings["teacher_iterations"])
+            seats.append(
+                Seat(
+                    kind, _stock_ppo(name, settings, example, env, cfg, device), planes=planes,
+                    schedule={**settings["schedule"], "symmetry": settings["symmetry"]},
+                    teacher=teacher,
+                )
+            )  # fmt: skip
         afterstates = None
-        if env.afterstates is not None:
-            afterstates = AfterstateLearner(env.afterstates, cfg["num_steps_per_env"], env.num_envs)
-        return PackingPPO(
-            learners, orientation_agent, placement_agent, env, schedules, iterations, afterstates,
-            imitations,
-        )  # fmt: skip
+        if lookahead.critic is not None:
+            assert isinstance(lookahead.critic, AfterstateCritic), "a run's critic learns"
+            afterstates = AfterstateLearner(
+                lookahead.critic, lookahead, cfg["num_steps_per_env"], env.num_envs
+            )
+        return PackingPPO(seats, env, lookahead, own["iterations"], afterstates)
 
 
 def _stock_ppo(
@@ -339,7 +362,7 @@ def _stock_ppo(
     cfg: dict[str, Any],
     device: str,
 ) -> PPO:
-    """rsl_rl's own PPO with our actor and critic."""
+    """Build rsl_rl's own PPO with our actor and critic."""
     network = dict(settings["network"])
     model = {"agent": name, "network": network}
     agent_cfg = {
@@ -354,11 +377,7 @@ def _stock_ppo(
         "num_steps_per_env": cfg["num_steps_per_env"],
         "multi_gpu": cfg["multi_gpu"],
     }
-    alone = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
+    single = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
-        ppo: PPO = PPO.construct_algorithm(obs, alone, agent_cfg, device)
-    if ppo.actor.afterstates is not None:
-        # One for all agents, in place of the actor's own: rsl_rl would copy what it is given. The
-        # optimiser still lists the weights of the other, which never have a gradient.
-        ppo.actor.afterstates = env.afterstates
+        ppo: PPO = PPO.construct_algorithm(obs, single, agent_cfg, device)
     return ppo

@@ -23,11 +23,13 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 import marl_pack
-from marl_pack.agents.learning import checkpoint
+from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.ppo import PackingPPO
-from marl_pack.agents.networks.actor_critic import AGENTS
+from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice
 from marl_pack.agents.networks.trunk import Network, widen
-from marl_pack.agents.policy import Policy
+from marl_pack.agents.policy import Placement, Policy
+from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
@@ -135,9 +137,9 @@ class Runner(OnPolicyRunner):
         self.stop_requested = False
         self.last_iteration = 0  # of this call of learn()
         self._frozen = {
-            name: settings["frozen"]
+            name: settings["record"]
             for name, settings in train_cfg["agents"].items()
-            if settings.get("frozen")
+            if "record" in settings
         }
 
     def train(self, iterations: int) -> None:
@@ -182,7 +184,9 @@ class Runner(OnPolicyRunner):
         state = self._gather(self.state())
         if self.gpu_global_rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            checkpoint.write(self.folder / checkpoint.LATEST, self.checkpoint() | {"state": state})
+            checkpoints.write(
+                self.folder / checkpoints.LATEST, self.checkpoint() | {"state": state}
+            )
 
     def _evaluate(self, progress: Progress) -> None:
         """Add a row to the history; keep the checkpoint if it is the best so far."""
@@ -206,7 +210,7 @@ class Runner(OnPolicyRunner):
             )
         self.evaluated(self.evaluations)
         if row["utilization"] > best:
-            checkpoint.write(self.folder / checkpoint.BEST, self.checkpoint())  # type: ignore[operator]  # likewise
+            checkpoints.write(self.folder / checkpoints.BEST, self.checkpoint())  # type: ignore[operator]  # likewise
 
     # --- checkpoints ------------------------------------------------------------------------------
 
@@ -217,11 +221,12 @@ class Runner(OnPolicyRunner):
             name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
             for name, state in algorithm.pop("learners").items()
         }
-        for name in learned:
-            if self.alg.imitated(name) is not None:  # to go on without the old file
-                learned[name]["imitated"] = self.cfg["agents"][name]["imitated"]
+        for seat in self.alg.seats:
+            if seat.teacher_at(self.alg.iteration) is not None:  # to go on without the old file
+                name = seat.kind.name
+                learned[name]["teacher"] = self.cfg["agents"][name]["teacher"]
         return {
-            "format": checkpoint.FORMAT,
+            "format": checkpoints.FORMAT,
             "marl_pack": marl_pack.__version__,
             "config": self.config,
             "agents": learned | self._frozen,
@@ -249,7 +254,7 @@ class Runner(OnPolicyRunner):
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         """Write a checkpoint; rsl_rl calls this every ``save_interval`` iterations."""
-        checkpoint.write(Path(path), self.checkpoint() | {"infos": infos})
+        checkpoints.write(Path(path), self.checkpoint() | {"infos": infos})
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(
@@ -260,70 +265,72 @@ class Runner(OnPolicyRunner):
         map_location: str | None = None,
     ) -> dict[str, Any] | None:
         """Load networks and optimisers from a checkpoint, to learn on from its next iteration."""
-        found = checkpoint.read(path, map_location or self.device)
-        if self.alg.load(found | {"learners": found["agents"]}, load_cfg, strict):
-            self.current_learning_iteration = found["iter"] + 1
-        infos: dict[str, Any] | None = found.get("infos")
+        checkpoint = checkpoints.read(path, map_location or self.device)
+        if self.alg.load(checkpoint | {"learners": checkpoint["agents"]}, load_cfg, strict):
+            self.current_learning_iteration = checkpoint["iter"] + 1
+        infos: dict[str, Any] | None = checkpoint.get("infos")
         return infos
 
-    def begin_with(self, found: Mapping[str, Any]) -> None:
+    def begin_with(self, checkpoint: Mapping[str, Any]) -> None:
         """Take the learners' weights from another run; nothing else of it.
 
         Args:
-            found: what :func:`marl_pack.agents.learning.checkpoint.read` gave.
+            checkpoint: as :func:`marl_pack.agents.learning.checkpoint.read` returns it.
 
         Raises:
             ValueError: if an agent that learns here did not there, or has another network (it may
                 see more planes here: those weigh 0 at first).
         """
         for name, ppo in self.alg.learners.items():
-            agent = found["agents"].get(name, {})
+            agent = checkpoint["agents"].get(name, {})
             if "critic_state_dict" not in agent:
                 raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
-            mine, theirs = (
+            new, old = (
                 Network(**network)
                 for network in (self.cfg["agents"][name]["network"], agent["network"])
             )
-            more = set(theirs.planes) <= set(mine.planes)
-            wanted = asdict(mine) | ({"planes": theirs.planes} if more else {})
-            held = asdict(theirs).items()
-            if other := {key: value for key, value in held if wanted[key] != value}:
+            more = set(old.planes) <= set(new.planes)
+            wanted = asdict(new) | ({"planes": old.planes} if more else {})
+            if other := {key: v for key, v in asdict(old).items() if wanted[key] != v}:
                 raise ValueError(
                     f"init: the checkpoint's {name} agent has another network: {other}; begin with "
                     "the same, or one that sees more planes (--config with the settings of its run)"
                 )
             for part in ("actor", "critic"):
-                weights = widen(agent[f"{part}_state_dict"], theirs, mine, AGENTS[name].WAYS)
-                model = getattr(ppo, part)
-                own = {k: v for k, v in model.state_dict().items() if k.startswith("afterstates.")}
-                model.load_state_dict(own | weights)  # a critic that there was not begins fresh
-        self.env.game.forget(self.env.afterstates)
+                weights = agent[f"{part}_state_dict"]
+                orientations = AGENT_KINDS[name].orientations
+                getattr(ppo, part).load_state_dict(widen(weights, old, new, orientations))
+        if "afterstate_critic" in checkpoint:  # else it begins fresh
+            self.alg.load_afterstate_critic(checkpoint["afterstate_critic"])
 
-    def resume(self, found: Mapping[str, Any]) -> None:
+    def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on exactly from the checkpoint of a run with the same settings.
 
         Args:
-            found: what :func:`marl_pack.agents.learning.checkpoint.read` gave of the run's latest.
+            checkpoint: the run's latest, as :func:`marl_pack.agents.learning.checkpoint.read`
+                returns it.
 
         Raises:
             ValueError: if the checkpoint cannot be resumed by this run.
         """
-        states = found.get("state")
+        states = checkpoint.get("state")
         if states is None:
             raise ValueError("this checkpoint holds no state of the game; resume from latest.pt")
+        if isinstance(states, str):  # it says why it cannot be resumed
+            raise ValueError(f"this run cannot be resumed: {states}")
         if len(states) != self.gpu_world_size:
             raise ValueError(
                 f"the run had {len(states)} processes, this one has {self.gpu_world_size}"
             )
         try:
-            self.alg.load(dict(found) | {"learners": found["agents"]}, None, True)
+            self.alg.load(dict(checkpoint) | {"learners": checkpoint["agents"]}, None, True)
             if self.alg.afterstates is not None:
                 own_critic = states[self.gpu_global_rank]["afterstates"]
                 self.alg.afterstates.load_state_dict(own_critic)
         except (RuntimeError, KeyError, TypeError) as error:
             raise ValueError(f"the checkpoint does not fit its own settings: {error}") from None
-        self.current_learning_iteration = found["iter"] + 1
-        self.evaluations = list(found["evaluations"])
+        self.current_learning_iteration = checkpoint["iter"] + 1
+        self.evaluations = list(checkpoint["evaluations"])
         own = states[self.gpu_global_rank]
         self.env.game.load_state_dict(own["game"])
         for name in LOGGER_STATE:
@@ -336,8 +343,23 @@ class Runner(OnPolicyRunner):
             torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
-        """The policy as it is now, each agent taking its most probable action."""
-        return checkpoint.load_policy(self.checkpoint(), device or self.device)
+        """Return the policy as it is now, each agent taking its most probable action."""
+        agents = [
+            LearnedAgent(seat.kind.name, seat.ppo.actor, self.alg.lookahead)
+            if seat.ppo is not None
+            else seat.frozen
+            for seat in self.alg.seats
+        ]
+
+        def play(game: Packing) -> Placement:
+            choice: Choice = ()
+            for seat, agent in zip(self.alg.seats, agents, strict=True):
+                assert agent is not None, "an agent learns or is frozen"
+                choice = seat.kind.extend(choice, agent(game, *choice), game.floor)
+            orientation, cell = choice
+            return orientation, cell
+
+        return play
 
     def export_policy_to_onnx(self, path: str, *args: Any, **named: Any) -> None:
         """Refused: there is more than one policy, and masks, which rsl_rl's exporter does not know.

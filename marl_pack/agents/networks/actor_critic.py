@@ -3,46 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from marl_pack.agents import joint, orientation, placement
-from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.networks.distribution import MaskedCategorical
-from marl_pack.agents.networks.trunk import Features, Network, Trunk, pooled_head
-from marl_pack.game.packing import Packing
-
-AGENTS: dict[str, ModuleType] = {
-    "orientation": orientation,
-    "placement": placement,
-    "joint": joint,
-}
-"""Name -> the module with its ``observe``, its ``make_head`` and the orientations it judges."""
+from marl_pack.agents.networks.heads import pooled_head
+from marl_pack.agents.networks.kinds import AGENT_KINDS
+from marl_pack.agents.networks.planes import Observation
+from marl_pack.agents.networks.trunk import Features, Network, Trunk
 
 
 class Actor(MLPModel):
     """An agent's policy: trunk (``cnns``), head (``mlp``) and masked distribution.
 
     Args:
-        obs: an observation of N bins; any Mapping of tensors does.
+        obs: an observation of G games; any Mapping of tensors does.
         obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
-        agent: one of :data:`AGENTS`.
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         network: fields of :class:`marl_pack.agents.networks.trunk.Network`.
-
-    Attributes:
-        afterstates: who says what placements are worth, if its network sees that, else None. Kept
-            with the actor's weights; it learns by itself.
     """
-
-    afterstates: AfterstateCritic | None
 
     def __init__(
         self,
-        obs: Mapping[str, Tensor],
+        obs: Observation,
         obs_groups: dict[str, list[str]],
         obs_set: str,
         output_dim: int,
@@ -51,44 +37,35 @@ class Actor(MLPModel):
         network: Mapping[str, Any],
     ) -> None:
         nn.Module.__init__(self)  # MLPModel's own would build a perceptron for flat observations
-        shape = Network(**network)
+        shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
-        self.cnns = Trunk(AGENTS[agent].WAYS, shape)
-        self.mlp = AGENTS[agent].make_head(shape)
-        self.afterstates = AfterstateCritic() if "worth" in shape.planes else None
+        self.cnns = Trunk(kind.orientations, shape)
+        self.mlp = kind.head(shape)
         self.distribution = MaskedCategorical(1)
-        self._observe = AGENTS[agent].observe
-
-    def see(self, game: Packing, *chosen: Tensor) -> dict[str, Tensor]:
-        """What the agent sees of N bins; the placement agent once orientations [N] are chosen."""
-        seen: dict[str, Tensor] = self._observe(
-            game, self.cnns.planes, *chosen, afterstates=self.afterstates
-        )
-        return seen
 
     def get_latent(
-        self, obs: Mapping[str, Tensor], masks: Tensor | None = None, hidden_state: None = None
+        self, obs: Observation, masks: Tensor | None = None, hidden_state: None = None
     ) -> Features:
-        """Features of the cells; hands the action mask to the distribution."""
+        """Compute the features of the cells; hand the action mask to the distribution."""
         self.distribution.mask = obs["mask"]
-        return self.cnns.keep(obs)
+        return self.cnns.store(obs)
 
-    def log_probs(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Log-probabilities of all actions, float32 [B, K]; draws no random numbers."""
+    def log_probs(self, obs: Observation) -> Tensor:
+        """Compute log-probabilities of all actions, float32 [G, K]; draws no random numbers."""
         return self.distribution.masked(self.mlp(self.get_latent(obs))).log_softmax(-1)
 
 
 class Critic(MLPModel):
-    """An agent's value of the state it sees at its turn, [B, 1].
+    """An agent's value of the state that it observes at its turn, [G, 1].
 
     Args:
         obs, obs_groups, obs_set, output_dim, agent, network: as for :class:`Actor`.
-        cnns: the actor's trunk, to look at its features instead of having a trunk.
+        cnns: the actor's trunk, to use its features instead of having a trunk.
     """
 
     def __init__(
         self,
-        obs: Mapping[str, Tensor],
+        obs: Observation,
         obs_groups: dict[str, list[str]],
         obs_set: str,
         output_dim: int,
@@ -98,33 +75,33 @@ class Critic(MLPModel):
         cnns: Trunk | None = None,
     ) -> None:
         nn.Module.__init__(self)
-        shape = Network(**network)
+        shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
         self.distribution = None
         if cnns is None:
-            self.cnns = Trunk(AGENTS[agent].WAYS, shape)
+            self.cnns = Trunk(kind.orientations, shape)
             self._features = self.cnns.forward
         else:
             # Not registered as a part: its weights belong to the actor's state and parameters.
             self._features = cnns.take
-        self.mlp = pooled_head(shape, AGENTS[agent].WAYS, output_dim, 1.0)
+        self.mlp = pooled_head(shape, kind.orientations, output_dim, 1.0)
 
     def get_latent(
-        self, obs: Mapping[str, Tensor], masks: Tensor | None = None, hidden_state: None = None
+        self, obs: Observation, masks: Tensor | None = None, hidden_state: None = None
     ) -> Features:
-        """Features of the cells."""
+        """Compute the features of the cells."""
         return self._features(obs)
 
 
 def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | str) -> Actor:
-    """An actor with fresh weights, to load a checkpoint into."""
+    """Build an actor with fresh weights, to load a checkpoint into."""
     return Actor({}, {"actor": []}, "actor", 1, agent=agent, network=network).to(device)
 
 
 def make_critic(
     agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor | None = None
 ) -> Critic:
-    """A critic with fresh weights; one that shares its actor's trunk needs that actor."""
+    """Build a critic with fresh weights; one that shares its actor's trunk needs that actor."""
     trunk = actor.cnns if actor is not None and Network(**network).share_trunk else None
     critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
     return critic.to(device)

@@ -1,0 +1,259 @@
+"""Command line of the examples, and the compliance report of what a trainer did.
+
+A trainer passes if it plays no illegal action, goes on to new items, changes the weights that both
+agents choose actions by, and credits both with the environment's rewards (in sum).
+:class:`Session` checks that from outside: it wraps the environment, keeps weights from before, and
+plays held-out sequences before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pettingzoo.utils.wrappers import BaseWrapper
+
+from marl_pack import env_aec
+from marl_pack.env_aec import AGENTS
+from marl_pack.evaluation.statistics import interval
+from marl_pack.files import write_json
+from marl_pack.integrations.network import ActorCritic
+
+HELD_OUT = 10**9
+"""Seed of the sequences that are played before and after; training has smaller ones."""
+
+
+class Counted(BaseWrapper):
+    """The environment, with a count of what is done in it.
+
+    Attributes:
+        items: items placed.
+        illegal: actions played against the mask.
+        seeded: resets with a seed, each of which begins the stream of items again.
+        totals: agent -> sum of its rewards.
+    """
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.items, self.illegal, self.seeded = 0, 0, 0
+        self.totals = dict.fromkeys(AGENTS, 0.0)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begin an episode, and count its seed."""
+        self.seeded += seed is not None
+        super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> None:
+        """Play the action, and count it."""
+        agent = self.env.agent_selection
+        played = not (self.env.terminations[agent] or self.env.truncations[agent])
+        if played:
+            raw = self.env.unwrapped
+            self.illegal += not raw.action_mask(agent)[int(action)]
+            self.items += agent == AGENTS[1]
+        super().step(action)
+        if played:
+            for name, reward in self.env.rewards.items():
+                self.totals[name] += float(reward)
+
+
+class Session:
+    """One run of an example.
+
+    Attributes:
+        items: how many items to train on, about.
+        turns: how many turns of both agents to play between two updates, about.
+        bin_size: W, D, H in cells.
+        seed: of weights and items.
+
+    Args:
+        arguments: of the command line.
+        description: what ``--help`` says.
+    """
+
+    def __init__(self, arguments: Sequence[str] | None = None, description: str = "") -> None:
+        options = argparse.ArgumentParser(description=description)
+        add = options.add_argument
+        add("--items", type=int, default=100_000, help="to train on (default: 100,000)")
+        add("--turns", type=int, default=2048,
+            help="of both agents between two updates, about (default: 2048)")  # fmt: skip
+        add("--minutes", type=float, help="end after so long, even if items are left")
+        add("--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
+            help="bin size in cells (default: 10 10 10)")  # fmt: skip
+        add("--sides", type=int, nargs=2, default=(2, 5), metavar=("SHORTEST", "LONGEST"),
+            help="sides of the items (default: 2 5)")  # fmt: skip
+        add("--episodes", type=int, default=100,
+            help="held-out sequences played before and after (default: 100)")  # fmt: skip
+        add("--seed", type=int, default=0, help="of weights and items (default: 0)")
+        add("--json", type=Path, metavar="FILE", help="write the compliance report there")
+        chosen = options.parse_args(arguments)
+        self.items, self.turns, self.seed = chosen.items, chosen.turns, chosen.seed
+        self.episodes = chosen.episodes
+        self.bin_size, self.sides = tuple(chosen.bin), tuple(chosen.sides)
+        self.json: Path | None = chosen.json
+        if self.episodes < 2:
+            options.error("--episodes: at least 2, for an interval")
+        self.minutes = chosen.minutes or float("inf")
+        self.envs: list[Counted] = []
+        self.credited = dict.fromkeys(AGENTS, 0.0)
+        torch.set_num_threads(1)
+        torch.manual_seed(chosen.seed)
+        np.random.seed(chosen.seed)  # noqa: NPY002  # some trainers draw from there
+
+    def env(self, **options: Any) -> Counted:
+        """Return a new AEC environment (:func:`marl_pack.env_aec.env`), counted."""
+        env = Counted(env_aec.env(bin_size=self.bin_size, sides=self.sides, **options))
+        self.envs.append(env)
+        return env
+
+    def parallel_env(self, **options: Any) -> env_aec.Turns:
+        """Return the same, turn by turn, as :func:`marl_pack.env_aec.parallel_env` gives it."""
+        return env_aec.Turns(self.env(**options))
+
+    def go_on(self) -> bool:
+        """Return whether items and minutes are left to train."""
+        return self.placed < self.items and self.elapsed < self.minutes
+
+    @property
+    def elapsed(self) -> float:
+        """Minutes since training began."""
+        return (time.monotonic() - self.start) / 60
+
+    @property
+    def placed(self) -> int:
+        """Items placed in all environments."""
+        return sum(env.items for env in self.envs)
+
+    def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
+        """Watch the networks that will learn (twice the same, if one plays both turns).
+
+        Training begins here: its minutes are counted from now.
+        """
+        self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
+        self.before = {name: self._head(name) for name in AGENTS}
+        self.utilization_before = self.play()
+        for env in self.envs:
+            env.seeded = 0
+        self.start = time.monotonic()
+
+    def _head(self, agent: str) -> torch.Tensor:
+        """Return the weights that only the agent's own choices change, not the critic."""
+        network = self.networks[agent]
+        head = network.orientations if agent == AGENTS[0] else network.cells
+        return head.weight.detach().cpu().clone()
+
+    def credit(self, agent: str, reward: float) -> None:
+        """Record a reward that the trainer stored for an agent."""
+        self.credited[agent] += float(reward)
+
+    @torch.no_grad()
+    def play(self) -> tuple[float, float]:
+        """Return the mean utilization over held-out sequences, and half its 95 % interval.
+
+        Each agent takes its most probable action. The interval is Student's.
+        """
+        both = self.networks[AGENTS[0]].agent == "both"
+        env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
+        reached = []
+        for episode in range(self.episodes):
+            env.reset(seed=HELD_OUT if episode == 0 else None)
+            for agent in env.agent_iter():
+                observation, _, terminated, truncated, info = env.last()
+                if terminated or truncated:
+                    reached.append(info["utilization"])
+                    break
+                network = self.networks[agent]
+                planes, mask = (torch.as_tensor(observation[k], device=network.device)[None]
+                                for k in ("observation", "action_mask"))  # fmt: skip
+                env.step(int(network(planes, mask)[0].argmax()))
+        low, high = interval(np.array(reached)) or (np.nan, np.nan)  # there are two or more
+        return float(np.mean(reached)), (high - low) / 2
+
+    def report(self, trainer: str, package: str) -> dict[str, Any]:
+        """Return the compliance report.
+
+        Args:
+            trainer: name that is shown.
+            package: the trainer's package, whose version is shown.
+        """
+        minutes = self.elapsed
+        env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
+        updated = {a: not torch.equal(self.before[a], self._head(a)) for a in AGENTS}
+        right = {
+            a: abs(env_rewards[a] - self.credited[a]) <= 1e-4 * max(1.0, abs(env_rewards[a]))
+            for a in AGENTS
+        }
+        return {
+            "trainer": trainer,
+            "version": metadata.version(package),
+            "bin": self.bin_size,
+            "items": self.placed,
+            "minutes": minutes,
+            "illegal": sum(env.illegal for env in self.envs),
+            "repeats": sum(max(0, env.seeded - 1) for env in self.envs),
+            "updated": updated,
+            "rewards_right": right,
+            "rewards": env_rewards,
+            "credited": self.credited,
+            "episodes": self.episodes,
+            "before": self.utilization_before,
+            "after": self.play(),
+        }
+
+
+_running: list[Session] = []
+
+
+def current() -> Session:
+    """Return the session that runs, for trainers that make environments from a pickled function."""
+    return _running[-1]
+
+
+def run(
+    trainer: str,
+    package: str,
+    train: Callable[[Session], None],
+    arguments: Sequence[str] | None = None,
+    description: str = "",
+) -> int:
+    """Run an example and print its compliance report.
+
+    Returns:
+        The exit status: 0 if it :func:`passes`.
+    """
+    session = Session(arguments, description)
+    _running.append(session)
+    train(session)
+    report = session.report(trainer, package)
+    for key, value in report.items():
+        print(f"{key}: {percent(value) if key in ('before', 'after') else value}")
+    if session.json is not None:
+        write_json(session.json, report)
+    if not passes(report):
+        print("DOES NOT PASS", file=sys.stderr)
+        return 1
+    print("passes")
+    return 0
+
+
+def percent(reached: tuple[float, float]) -> str:
+    """Return a utilization and half its interval as text."""
+    return f"{100 * reached[0]:.1f} ± {100 * reached[1]:.1f} %"
+
+
+def passes(report: dict[str, Any]) -> bool:
+    """Return whether a report has items, no faults, and both agents updated and credited right."""
+    return bool(
+        report["items"]
+        and not report["illegal"]
+        and not report["repeats"]
+        and all(report["updated"].values())
+        and all(report["rewards_right"].values())
+    )

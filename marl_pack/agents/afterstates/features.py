@@ -1,0 +1,43 @@
+"""The features of afterstates that their critic sees."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.afterstates.afterstates import MOST_LENGTHS, SURFACE, Afterstates
+
+PAIRS = MOST_LENGTHS * (MOST_LENGTHS + 1) // 2
+FEATURES = 2 + PAIRS * MOST_LENGTHS + SURFACE
+"""Number of features of an afterstate."""
+
+
+def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) -> Tensor:
+    """Compute the features of afterstates, float32 [K, :data:`FEATURES`].
+
+    They are the filled share of the bin and its square; the logarithms of the numbers of cells
+    where each box that may come could be placed, one number for a footprint and the same footprint
+    rotated by 90°; and the surface. None of them changes when the bin is mirrored or rotated. Boxes
+    of fewer than :data:`MOST_LENGTHS` lengths take the places of the longest.
+
+    Args:
+        afterstates: what placements leave.
+        volume: W · D · H.
+        rows: int64 [K], of these placements alone.
+    """
+    counts, surface, filled = afterstates.counts, afterstates.surface, afterstates.filled
+    if rows is not None:
+        counts, surface, filled = counts[rows], surface[rows], filled[rows]
+    lengths = counts.shape[1]
+    first = MOST_LENGTHS - lengths
+    both = counts + counts.transpose(1, 2)
+    i, j = torch.triu_indices(lengths, lengths, device=counts.device)
+    w, _ = torch.triu_indices(MOST_LENGTHS, MOST_LENGTHS, device=counts.device)
+    values = torch.zeros(len(counts), FEATURES, device=counts.device)
+    boxes = values[:, 2 : 2 + PAIRS * MOST_LENGTHS].view(-1, PAIRS, MOST_LENGTHS)
+    known = (w >= first).nonzero().squeeze(1)  # in the order of i, j
+    boxes[:, known, first:] = both[:, i, j].float().log1p() / 2
+    share = filled.float() / volume
+    values[:, 0], values[:, 1] = share, share.square()
+    values[:, 2 + PAIRS * MOST_LENGTHS :] = 2 * surface
+    return values

@@ -1,0 +1,157 @@
+"""What placements leave and how good that is, computed once a turn for all agents of a player.
+
+A player owns a :class:`Lookahead`; its agents share it. Neither the game nor the environment knows
+of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
+from marl_pack.agents.afterstates.features import features
+from marl_pack.game.packing import Packing
+
+T = TypeVar("T")
+
+ILLEGAL = -1e6
+"""Value of a placement that is not legal: less than any that is."""
+AT_ONCE = 1 << 15
+"""Afterstates that the critic values at once, at most."""
+
+
+class Memo:
+    """Results that are computed once a turn, for one turn of one game at a time."""
+
+    def __init__(self) -> None:
+        self._turn = -1
+        self._results: dict[Any, Any] = {}
+
+    def once(self, game: Packing, name: Any, compute: Callable[[], T]) -> T:
+        """Return the result of this name in the game's turn; compute it if it is not there."""
+        if self._turn != game.turn:
+            self._turn, self._results = game.turn, {}
+        if name not in self._results:
+            self._results[name] = compute()
+        result: T = self._results[name]
+        return result
+
+    def forget(self, name: Any) -> None:
+        """Drop a result, to be computed again when it is next needed."""
+        self._results.pop(name, None)
+
+    def follow(self, game: Packing, games: Tensor, branched: Packing) -> None:
+        """Carry the results over to the games ``games`` (int64 [K]) of ``game``, now a branch."""
+        if self._turn == game.turn:
+            self._results = {
+                name: result.select(games) if isinstance(result, Afterstates) else result[games]
+                for name, result in self._results.items()
+            }
+            self._turn = branched.turn
+
+
+class Value(Protocol):
+    """A critic of afterstates: features [K, F] → the return still to come [K]."""
+
+    def __call__(self, inputs: Tensor, /) -> Tensor:
+        """Estimate the values, float32 [K]."""
+
+
+class Lookahead:
+    """What the legal placements of the visible items would leave, and its value.
+
+    All results cover boxes with sides between the shortest and longest of the game's stream, and
+    ask ``hull_alpha`` where they could be placed, whatever the game's own rule.
+
+    Args:
+        critic: which estimates values of afterstates; None where nobody asks for them.
+        memo: which keeps the results; shared by players that look at the same games.
+    """
+
+    def __init__(self, critic: Value | None = None, memo: Memo | None = None) -> None:
+        self.critic = critic
+        self.memo = memo or Memo()
+
+    def afterstates(self, game: Packing) -> Afterstates:
+        """Compute what each legal placement would leave."""
+
+        def compute() -> Afterstates:
+            sides = game.orient_item(game.items).sides
+            return afterstates_of(game.bins, sides, game.mask, probe_lengths(*game.stream.sides))
+
+        return self.memo.once(game, "afterstates", compute)
+
+    def feasible_cells(self, game: Packing) -> Tensor:
+        """Compute in how many cells, on average, a box that may come could be placed afterwards.
+
+        Returns:
+            Float32 [G, 6, W, D] for each placement; 0 where it is not legal.
+        """
+
+        def compute() -> Tensor:
+            afterstates = self.afterstates(game)
+            return afterstates.as_map(afterstates.feasible_cells(), game.mask)
+
+        return self.memo.once(game, "feasible_cells", compute)
+
+    def feasible_probability(self, game: Packing) -> Tensor:
+        """Compute how probable it is that the next item has a legal place after each placement.
+
+        Each box between the shortest and longest side of the stream is equally probable, in the
+        orientations that the stream's items may take.
+
+        Returns:
+            Float32 [G, 6, W, D]; 0 where the placement is not legal.
+        """
+
+        def compute() -> Tensor:
+            afterstates = self.afterstates(game)
+            probability = afterstates.feasible_probability(game.orientation_sets)
+            return afterstates.as_map(probability, game.mask)
+
+        return self.memo.once(game, "feasible_probability", compute)
+
+    def afterstate_value(self, game: Packing) -> Tensor:
+        """Estimate the return from each placement on: its reward (Eq. 5) and the critic's value.
+
+        Returns:
+            Float32 [G, 6, W, D]; :data:`ILLEGAL` where the placement is not legal.
+
+        Raises:
+            ValueError: if there is no critic.
+        """
+        critic = self.critic
+        if critic is None:
+            raise ValueError("the plane afterstate_value needs a critic of afterstates")
+
+        def compute() -> Tensor:
+            afterstates, spec = self.afterstates(game), game.spec
+            rows = torch.arange(len(afterstates.volume), device=game.device)
+            with torch.no_grad():
+                value = [
+                    critic(features(afterstates, game.volume, part))
+                    for part in torch.split(rows, AT_ONCE)
+                ]
+            gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
+            reward = (gain - loss) / game.volume
+            return afterstates.as_map((reward + torch.cat(value)).float(), game.mask, ILLEGAL)
+
+        return self.memo.once(game, ("afterstate_value", critic), compute)
+
+    def heightmap(self, game: Packing) -> Tensor:
+        """Return a copy of the heightmaps int16 [G, W, D] that stays as it is."""
+        return self.memo.once(game, "heightmap", game.bins.heightmap.clone)
+
+    def forget_values(self) -> None:
+        """Drop the values of afterstates, after the critic has learned."""
+        self.memo.forget(("afterstate_value", self.critic))
+
+    def branch(self, game: Packing, games: Tensor) -> Packing:
+        """Return ``game.branch(games)``; what is known of the turn goes with it."""
+        branched = game.branch(games)
+        self.memo.follow(game, games, branched)
+        return branched

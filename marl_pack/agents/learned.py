@@ -1,0 +1,53 @@
+"""A trained network as an agent that plays."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.networks.actor_critic import Actor
+from marl_pack.agents.networks.kinds import observe
+from marl_pack.agents.networks.planes import Observation
+from marl_pack.agents.networks.symmetry import mean_probabilities
+from marl_pack.game.packing import Packing
+
+
+class LearnedAgent:
+    """One agent's network, which takes its most probable action.
+
+    Args:
+        kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+        actor: the network.
+        lookahead: what placements leave, and its value; shared with the other agent.
+        symmetric: whether the network is asked in all symmetries of the bin
+            (:func:`marl_pack.agents.networks.symmetry.mean_probabilities`).
+    """
+
+    def __init__(
+        self, kind: str, actor: Actor, lookahead: Lookahead, symmetric: bool = False
+    ) -> None:
+        self.kind, self.actor, self.lookahead = kind, actor, lookahead
+        self.symmetric = symmetric
+
+    def observe(self, game: Packing, *orientation: Tensor) -> Observation:
+        """Return what the agent observes; the placement agent once orientations are chosen."""
+        return observe(self.kind, game, self.actor.cnns.planes, self.lookahead, *orientation)
+
+    def probabilities(self, observation: Observation) -> Tensor:
+        """Compute the probabilities of all actions, float64 [G, K]."""
+        if self.symmetric:
+            return mean_probabilities(self.actor, observation, self.kind).double()
+        return self.actor.log_probs(observation).double().exp()
+
+    def best(self, observation: Observation) -> Tensor:
+        """Return the most probable action, int64 [G], asking the network once."""
+        return self.actor(observation).squeeze(1).long()
+
+    @torch.inference_mode()
+    def __call__(self, game: Packing, *orientation: Tensor) -> Tensor:
+        """Return the most probable action, int64 [G]."""
+        observation = self.observe(game, *orientation)
+        if self.symmetric:
+            return self.probabilities(observation).argmax(1)
+        return self.best(observation)

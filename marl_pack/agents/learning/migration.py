@@ -1,0 +1,111 @@
+"""Reading checkpoints of format 1 as those of format 2.
+
+Format 1 had other names for planes, policies and settings, and kept the critic of afterstates once
+in each actor's weights. Its state of a run in play cannot be gone on with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marl_pack import renamed
+
+CRITIC = "afterstates."
+"""Prefix of the critic's weights among an actor's."""
+
+UNRESUMABLE = (
+    "it was written by an earlier version, whose game in play this one cannot go on with; begin a "
+    "new run with --init and the settings of the old one"
+)
+
+
+def from_format_1(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint of format 1 as one of format 2.
+
+    ``state`` becomes a text that says why it cannot be resumed.
+    """
+    migrated = dict(checkpoint) | {"format": 2}
+    migrated["config"] = _settings(checkpoint["config"])
+    migrated["agents"] = {
+        name: _agent(record, learns="optimizer_state_dict" in record)
+        for name, record in checkpoint["agents"].items()
+    }
+    for name, record in checkpoint["agents"].items():
+        critic = _critic(record.get("actor_state_dict", {}))
+        if critic and "optimizer_state_dict" in record:  # the run's own, the same in each agent
+            migrated["afterstate_critic"] = critic
+            migrated["agents"][name].pop("afterstate_critic", None)
+    if "afterstates" in migrated:
+        migrated["afterstate_optimizer"] = migrated.pop("afterstates")
+    if "state" in migrated:
+        migrated["state"] = UNRESUMABLE
+    return migrated
+
+
+def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's settings by today's names."""
+    settings = dict(config)
+    for name in ("orientation", "placement"):
+        if name not in settings:
+            continue
+        agent = {renamed.AGENT_KEYS.get(key, key): value for key, value in settings[name].items()}
+        for key in agent.keys() & {"policy", "teacher"}:
+            agent[key] = renamed.POLICIES.get(str(agent[key]), agent[key])
+        if "network" in agent:
+            agent["network"] = _network(agent["network"])
+        settings[name] = agent
+    return settings
+
+
+def _network(network: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a network's shape with today's names of planes."""
+    planes = [renamed.PLANES.get(plane, plane) for plane in network.get("planes", [])]
+    return dict(network) | {"planes": planes}
+
+
+def _critic(weights: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the weights of the critic of afterstates among an actor's."""
+    return {key.removeprefix(CRITIC): w for key, w in weights.items() if key.startswith(CRITIC)}
+
+
+def _agent(record: Mapping[str, Any], learns: bool) -> dict[str, Any]:
+    """Return an agent's record without the critic of afterstates among its weights."""
+    agent = dict(record)
+    if "name" in agent:
+        agent["name"] = renamed.POLICIES.get(agent["name"], agent["name"])
+    if "network" in agent:
+        agent["network"] = _network(agent["network"])
+    if "imitated" in agent:
+        agent["teacher"] = _agent(agent.pop("imitated"), learns=False)
+    weights = agent.get("actor_state_dict", {})
+    critic = _critic(weights)
+    if critic:
+        agent["actor_state_dict"] = {k: w for k, w in weights.items() if not k.startswith(CRITIC)}
+        if not learns:
+            agent["afterstate_critic"] = critic
+        if "optimizer_state_dict" in agent:
+            first = [k for k in weights if not k.startswith(CRITIC)]
+            agent["optimizer_state_dict"] = _optimizer(
+                agent["optimizer_state_dict"], len(first), len(critic)
+            )
+    return agent
+
+
+def _optimizer(state: Mapping[str, Any], first: int, count: int) -> dict[str, Any]:
+    """Return an optimiser's state without ``count`` parameters from number ``first`` on.
+
+    An optimiser numbers its parameters: the actor's, which ended with the critic of afterstates,
+    then the critic's.
+    """
+
+    def number(old: int) -> int:
+        return old if old < first else old - count
+
+    dropped = range(first, first + count)
+    groups = [
+        dict(group) | {"params": [number(p) for p in group["params"] if p not in dropped]}
+        for group in state["param_groups"]
+    ]
+    own = {number(p): value for p, value in state["state"].items() if p not in dropped}
+    return {"state": own, "param_groups": groups}

@@ -1,0 +1,274 @@
+"""Agents and policies from names, runs' folders and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from marl_pack import renamed
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.lookahead import Lookahead, Memo
+from marl_pack.agents.heuristics import (
+    ORIENTATION_AGENTS,
+    POLICIES,
+    make_orientation_agent,
+    make_placement_agent,
+    make_policy,
+)
+from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
+from marl_pack.agents.networks.kinds import JOINT, ORIENTATION, PLACEMENT
+from marl_pack.agents.policy import (
+    OrientationAgent,
+    PlacementAgent,
+    Policy,
+    in_turns,
+)
+from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.game.spec import GameSpec
+from marl_pack.items import Stream
+
+NAMES = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
+"""Heuristics that can play an agent, by the agent's name."""
+
+
+class Loader:
+    """Loads agents that play together: they share what is computed once a turn.
+
+    Args:
+        device: of the games.
+        seed: of agents that play at random; None draws from torch's global generator.
+        symmetric: whether learned agents are asked in all symmetries of the bin.
+        memo: which keeps what is computed once a turn.
+    """
+
+    def __init__(
+        self,
+        device: torch.device | str = "cpu",
+        seed: int | None = 0,
+        symmetric: bool = False,
+        memo: Memo | None = None,
+    ) -> None:
+        self.device, self.seed, self.symmetric = device, seed, symmetric
+        self.memo = memo or Memo()
+        self._lookaheads: list[tuple[Mapping[str, Tensor] | None, Lookahead]] = []
+
+    # --- from what a user names -------------------------------------------------------------------
+
+    def policy(self, source: str) -> Policy:
+        """Return the policy that ``source`` names.
+
+        Args:
+            source: one of :data:`marl_pack.agents.heuristics.POLICIES`, a run's folder or a
+                checkpoint.
+
+        Raises:
+            ValueError, FileNotFoundError: if it is none of these.
+        """
+        if source in POLICIES:
+            return make_policy(source, self.seed, self.device)
+        return self.policy_of(checkpoints.read(_path(source, POLICIES), self.device))
+
+    def orientation_agent(self, source: str) -> OrientationAgent:
+        """Return the first agent: a heuristic's, a checkpoint's, or a joint agent's orientations.
+
+        Raises:
+            ValueError, FileNotFoundError: if there is none of that name.
+        """
+        if source not in ORIENTATION_AGENTS:
+            checkpoint = checkpoints.read(_path(source, ORIENTATION_AGENTS), self.device)
+            if JOINT in checkpoint["agents"]:
+                policy = self.policy_of(checkpoint)
+                return lambda game: policy(game)[0]
+        return self.orientation_agent_of(record_of(source, ORIENTATION))
+
+    def placement_agent(self, source: str) -> PlacementAgent:
+        """Return the second agent: a heuristic's, or a checkpoint's. Errors as above."""
+        return self.placement_agent_of(record_of(source, PLACEMENT))
+
+    # --- from what a checkpoint holds -------------------------------------------------------------
+
+    def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
+        """Return the whole policy of a checkpoint, frozen agents included."""
+        if JOINT in checkpoint["agents"]:
+            agent = self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT)
+            return lambda game: game.floor.split(agent(game))
+        return in_turns(
+            self.orientation_agent_of(checkpoints.agent_record(checkpoint, ORIENTATION)),
+            self.placement_agent_of(checkpoints.agent_record(checkpoint, PLACEMENT)),
+        )
+
+    def orientation_agent_of(self, record: Mapping[str, Any]) -> OrientationAgent:
+        """Return the first agent by its record."""
+        if "name" in record:
+            lookahead = self._lookahead(record)
+            return make_orientation_agent(record["name"], self.seed, self.device, lookahead)
+        return self.learned(record, ORIENTATION)
+
+    def placement_agent_of(self, record: Mapping[str, Any]) -> PlacementAgent:
+        """Return the second agent by its record."""
+        if "name" in record:
+            lookahead = self._lookahead(record)
+            return make_placement_agent(record["name"], self.seed, self.device, lookahead)
+        return self.learned(record, PLACEMENT)
+
+    def agent_of(self, record: Mapping[str, Any], name: str) -> Callable[..., Tensor]:
+        """Return one of the two agents by its record."""
+        makers: dict[str, Callable[[Mapping[str, Any]], Callable[..., Tensor]]] = {
+            ORIENTATION: self.orientation_agent_of,
+            PLACEMENT: self.placement_agent_of,
+        }
+        return makers[name](record)
+
+    def learned(self, record: Mapping[str, Any], kind: str) -> LearnedAgent:
+        """Return a learned agent by its record.
+
+        Raises:
+            ValueError: if it is none, or its weights do not fit its network.
+        """
+        actor = load_actor(record, kind, self.device)
+        return LearnedAgent(kind, actor, self._lookahead(record), self.symmetric)
+
+    def _lookahead(self, record: Mapping[str, Any]) -> Lookahead:
+        """Return the lookahead of an agent: agents with the same critic of afterstates share it."""
+        weights = record.get("afterstate_critic")
+        for own, lookahead in self._lookaheads:
+            if own is weights:
+                return lookahead
+        lookahead = Lookahead(load_afterstate_critic(record, self.device), self.memo)
+        self._lookaheads.append((weights, lookahead))
+        return lookahead
+
+    def planner(
+        self, checkpoint: Mapping[str, Any], settings: SearchSettings, futures: Stream
+    ) -> Planner:
+        """Return a policy that searches with the agents of a checkpoint.
+
+        Args:
+            checkpoint: of a run.
+            settings: how far to search.
+            futures: what may come.
+
+        Raises:
+            ValueError: if not both agents are learned ones, or their critic cannot value a depth.
+        """
+        first, second = (
+            self.learned(checkpoints.agent_record(checkpoint, name), name)
+            for name in (ORIENTATION, PLACEMENT)
+        )
+        critic = None
+        if settings.depth is not None:
+            config = checkpoint["config"]
+            alpha, gamma = config["game"]["alpha"], config["ppo"]["gamma"]
+            if (alpha, gamma) != (1, 1):
+                raise ValueError(
+                    f"plan: a depth needs agents trained with game.alpha = 1 and ppo.gamma = 1, "
+                    f"whose critic estimates shares of the bin, not {alpha:g} and {gamma:g}"
+                )
+            critic = load_critic(checkpoint, ORIENTATION, self.device, first.actor)
+        return Planner(first, second, critic, settings, futures, self.seed or 0)
+
+
+def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str) -> Actor:
+    """Return the network of a learned agent.
+
+    Args:
+        record: of the agent (:mod:`marl_pack.agents.learning.checkpoint`).
+        kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+        device: of the games.
+
+    Raises:
+        ValueError: if it has not learned, or its weights do not fit its network.
+    """
+    if "network" not in record:
+        raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
+    try:
+        with torch.random.fork_rng(devices=[]):  # fresh weights draw numbers that a run needs
+            actor = make_actor(kind, record["network"], device)
+        actor.load_state_dict(record["actor_state_dict"])
+    except (RuntimeError, TypeError, KeyError) as error:
+        raise ValueError(f"the {kind} agent's weights do not fit its network: {error}") from None
+    return actor.eval()
+
+
+def load_critic(
+    checkpoint: Mapping[str, Any], kind: str, device: torch.device | str, actor: Actor
+) -> Critic:
+    """Return the critic of one agent of a run, beside its ``actor``. Else as :func:`load_actor`."""
+    agent = checkpoint["agents"][kind]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            critic = make_critic(kind, agent["network"], device, actor)
+        critic.load_state_dict(agent["critic_state_dict"])
+    except (RuntimeError, KeyError) as error:
+        raise ValueError(f"the {kind} agent has no critic that fits: {error}") from None
+    return critic.eval()
+
+
+def load_afterstate_critic(
+    record: Mapping[str, Any], device: torch.device | str
+) -> AfterstateCritic | None:
+    """Return the critic of afterstates of a record or a checkpoint, None if it has none.
+
+    Raises:
+        ValueError: if its weights do not fit.
+    """
+    weights = record.get("afterstate_critic")
+    if weights is None:
+        return None
+    with torch.random.fork_rng(devices=[]):
+        critic = AfterstateCritic().to(device)
+    try:
+        critic.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(f"the critic of afterstates does not fit: {error}") from None
+    return critic.eval()
+
+
+def record_of(source: str, name: str) -> dict[str, Any]:
+    """Return the record of an agent that another run, or a heuristic, plays.
+
+    Args:
+        source: a heuristic's name, a run's folder or a checkpoint.
+        name: ``orientation`` or ``placement``.
+
+    Raises:
+        ValueError, FileNotFoundError: if it is none of these.
+    """
+    if source in NAMES[name]:
+        return {"name": source}
+    checkpoint = checkpoints.read(_path(source, NAMES[name]))
+    try:
+        return checkpoints.agent_record(checkpoint, name)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+
+
+def trained_on(checkpoint: Mapping[str, Any]) -> str:
+    """Describe the game that a checkpoint's agents learned, and for how long."""
+    config = checkpoint["config"]
+    game = config["game"]
+    sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
+    return (
+        f"{game['items']}{sides}, {GameSpec.of(game)}, {checkpoint['items']:,} items, "
+        f"seed {config['seed']}"
+    )
+
+
+def _path(source: str, names: Sequence[str]) -> Path:
+    """Return ``source`` as a path.
+
+    Raises:
+        ValueError, FileNotFoundError: if there is nothing there, naming what else it could be.
+    """
+    renamed.refuse_old(source, renamed.POLICIES, "policy")
+    if not Path(source).exists():
+        raise FileNotFoundError(
+            f"{source!r} is neither one of {', '.join(names)} nor a checkpoint or a run's folder"
+        )
+    return Path(source)

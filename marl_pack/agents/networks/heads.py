@@ -1,0 +1,44 @@
+"""The heads of the networks: features of cells in, logits or values out."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from marl_pack.agents.layers import initialized
+from marl_pack.agents.networks.trunk import Features, Network, count_features
+
+
+class Pool(nn.Module):
+    """:attr:`marl_pack.agents.networks.trunk.Features.pooled` as a layer."""
+
+    def forward(self, features: Features) -> Tensor:
+        """Return mean and maximum over the cells, [B, 2C]."""
+        return features.pooled
+
+
+def pooled_head(network: Network, orientations: int, outputs: int, gain: float) -> nn.Sequential:
+    """Build a head that makes ``outputs`` numbers of the pooled features, by one hidden layer."""
+    return nn.Sequential(
+        Pool(),
+        initialized(nn.Linear(2 * count_features(network, orientations), network.hidden)),
+        nn.ReLU(),
+        initialized(nn.Linear(network.hidden, outputs), gain),
+    )
+
+
+class ScoreMap(nn.Module):
+    """A head that scores each cell in A orientations, [B, A · W · D].
+
+    Args:
+        network: shape of the network.
+        orientations: A.
+    """
+
+    def __init__(self, network: Network, orientations: int) -> None:
+        super().__init__()
+        inputs = count_features(network, orientations)
+        self.scores = initialized(nn.Conv2d(inputs, orientations, 1), 0.01)
+
+    def forward(self, features: Features) -> Tensor:
+        """Return scores in the order of the actions: orientation, x, y."""
+        return self.scores(features.whole).flatten(1)

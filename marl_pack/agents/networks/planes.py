@@ -1,0 +1,244 @@
+"""The input planes of the networks: one record each in :data:`PLANES`.
+
+A plane says which tensors an observation gets for it and which input channels they become. All else
+derives from these records: the settings and their help, the symmetries of the bin, the exported
+files, and networks that grow more planes.
+
+The shape of a tensor in an observation says what it describes. In [G, W, D] each cell describes a
+column of the bin; in [G, A, W, D] each cell describes a placement with its low corner there, in one
+of the A orientations that the agent judges; [G, 1] is one number for the bin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.afterstates.lookahead import ILLEGAL, Lookahead
+from marl_pack.bins import utilization
+from marl_pack.game.moves import Moves
+from marl_pack.game.packing import Packing
+from marl_pack.geometry import resting_heights_and_waste
+
+Observation = Mapping[str, Tensor]
+"""The tensors that an agent observes, by name."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A turn of G games as one agent observes it.
+
+    Args:
+        game: the games.
+        lookahead: what placements leave, and its value.
+        planes: names of the planes that will be made.
+        orientation: int64 [G], once the orientations are chosen; None before.
+    """
+
+    game: Packing
+    lookahead: Lookahead
+    planes: Sequence[str]
+    orientation: Tensor | None = None
+
+    @cached_property
+    def item(self) -> Tensor:
+        """Sides of the item int16 [G, 3]: its own, or along x, y, z in the chosen orientation."""
+        if self.orientation is None:
+            return self.game.items.sides
+        return self.game.orient(self.orientation).sides
+
+    def judged(self, values: Tensor) -> Tensor:
+        """Return the values [G, 6, …] of the A orientations that the agent judges, [G, A, …]."""
+        if self.orientation is None:
+            return values
+        return Moves.gather(values, self.orientation)[:, None]
+
+    @cached_property
+    def mask(self) -> Tensor:
+        """Where the item may be placed in the orientations that the agent judges, [G, A, W, D]."""
+        return self.judged(self.game.mask)
+
+    @cached_property
+    def windows(self) -> tuple[Tensor, Tensor]:
+        """Resting height int16 and wasted cells int32 [G, A, W, D] (no entries if not needed)."""
+        if self.orientation is None:
+            sides = self.game.orient_item(self.game.items).sides
+        else:
+            sides = self.item[:, None]
+        bins = self.game.bins
+        return resting_heights_and_waste(
+            bins.heightmap, sides, bins.height, waste="waste" in self.planes, backend=bins.backend
+        )
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One plane that a network may see beside the paper's four channels.
+
+    Args:
+        name: its name in settings.
+        meaning: what it shows.
+        observe: a turn → tensors of the observation, by name; one of several planes may give a
+            tensor that another gives too.
+        channels: number of input channels for A orientations.
+        encode: the observation → input channels, float32 [G, …, W, D] each.
+    """
+
+    name: str
+    meaning: str
+    observe: Callable[[Sight], dict[str, Tensor]]
+    channels: Callable[[int], int]
+    encode: Callable[[Observation], list[Tensor]]
+
+
+def _shape(observation: Observation) -> torch.Size:
+    return observation["heightmap"].shape[1:]
+
+
+def _everywhere(number: Tensor, shape: torch.Size) -> Tensor:
+    """Repeat a number of each bin [G, 1] at every cell, [G, 1, W, D]."""
+    return number[:, :, None, None].expand(-1, 1, *shape)
+
+
+def _height(observation: Observation) -> Tensor:
+    """Return the bin's height H, float32 [G, 1, 1, 1]."""
+    return observation["height"].float()[:, :, None, None]
+
+
+def _encode_waste(observation: Observation) -> list[Tensor]:
+    volume = observation["item"].float().prod(1) + 1
+    return [observation["waste"].float() / volume[:, None, None, None]]
+
+
+def _observe_feasible_cells(sight: Sight) -> dict[str, Tensor]:
+    cells = sight.lookahead.feasible_cells(sight.game)
+    most = cells.flatten(1).amax(1, keepdim=True)
+    return {"feasible_cells": sight.judged(cells), "most_feasible_cells": most}
+
+
+def _encode_feasible_cells(observation: Observation) -> list[Tensor]:
+    cells, most = observation["feasible_cells"], observation["most_feasible_cells"]
+    close = 1 + 5 * (cells.log1p() - most[:, :, None, None].log1p())
+    level = _everywhere(most.log1p() / 4, _shape(observation))
+    return [close.clamp(min=0) * (cells > 0), level]
+
+
+def _observe_afterstate_value(sight: Sight) -> dict[str, Tensor]:
+    value = sight.judged(sight.lookahead.afterstate_value(sight.game))
+    best = value.flatten(1).amax(1, keepdim=True)
+    best = torch.where(best > ILLEGAL, best, 0)
+    return {"afterstate_value": value, "best_afterstate_value": best}
+
+
+def _encode_afterstate_value(observation: Observation) -> list[Tensor]:
+    best = observation["best_afterstate_value"]
+    behind = observation["afterstate_value"] - best[:, :, None, None]
+    near = [(1 + scale * behind).clamp(min=0) for scale in (20, 200)]
+    return [*near, _everywhere(best, _shape(observation))]
+
+
+PLANES: dict[str, Plane] = {
+    plane.name: plane
+    for plane in (
+        Plane(
+            "mask",
+            "the cells where the item may be placed",
+            lambda sight: {"legal_cells": sight.mask},
+            lambda orientations: orientations,
+            lambda observation: [observation["legal_cells"].float()],
+        ),
+        Plane(
+            "resting_height",
+            "the item's resting height at every cell, as a share of H",
+            lambda sight: {"resting_height": sight.windows[0]},
+            lambda orientations: orientations,
+            lambda observation: [observation["resting_height"].float() / _height(observation)],
+        ),
+        Plane(
+            "waste",
+            "the cells that the item would enclose, as a share of its own volume",
+            lambda sight: {"waste": sight.windows[1]},
+            lambda orientations: orientations,
+            _encode_waste,
+        ),
+        Plane(
+            "feasible_cells",
+            "in how many cells, on average, the next item may be placed afterwards: 1 for the most "
+            "that any placement leaves, 0 from a fifth less on; and how many that most is",
+            _observe_feasible_cells,
+            lambda orientations: orientations + 1,
+            _encode_feasible_cells,
+        ),
+        Plane(
+            "feasible_probability",
+            "how probable it is that the next item has a place afterwards",
+            lambda sight: {
+                "feasible_probability": sight.judged(
+                    sight.lookahead.feasible_probability(sight.game)
+                )
+            },
+            lambda orientations: orientations,
+            lambda observation: [observation["feasible_probability"]],
+        ),
+        Plane(
+            "afterstate_value",
+            "the return that a critic of afterstates expects from each placement on: 1 for the "
+            "best, 0 from a twentieth of the bin less on, again from a two-hundredth less on; and "
+            "the best itself",
+            _observe_afterstate_value,
+            lambda orientations: 2 * orientations + 1,
+            _encode_afterstate_value,
+        ),
+        Plane(
+            "grounded",
+            "the columns that are filled down to the floor, which carry boxes under hull_alpha",
+            lambda sight: {"grounded": sight.game.bins.empty_map == 0},
+            lambda orientations: 1,
+            lambda observation: [observation["grounded"].float()[:, None]],
+        ),
+        Plane(
+            "filled",
+            "how much of the bin is filled; where items were cut from the bin, this says how much "
+            "is still to come",
+            lambda sight: {"filled": utilization(sight.game.bins)[:, None].float()},
+            lambda orientations: 1,
+            lambda observation: [_everywhere(observation["filled"], _shape(observation))],
+        ),
+    )
+}
+"""Every plane by its name."""
+
+
+def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
+    """Build a network's input: the paper's four channels, then those of the planes.
+
+    The four channels are the heightmap as a share of H and the item's sides as shares of W, D and
+    H, so that they mean the same in every bin (paper, sec. III-D).
+
+    Args:
+        observation: ``heightmap`` int [G, W, D], ``item`` int [G, 3], ``height`` int [G, 1] (H),
+            and what the planes' records gave it.
+        planes: names in :data:`PLANES`.
+
+    Returns:
+        Float32 [G, C, W, D], channels last in memory.
+    """
+    heightmap, item = observation["heightmap"], observation["item"].float()
+    width, depth = heightmap.shape[1:]
+    height = observation["height"].float()  # [G, 1]
+    scale = torch.cat((torch.full_like(height, width), torch.full_like(height, depth), height), 1)
+    channels = [heightmap.float()[:, None] / height[:, :, None, None]]
+    channels.append((item / scale)[:, :, None, None].expand(-1, -1, width, depth))
+    for name in planes:
+        channels += PLANES[name].encode(observation)
+    return torch.cat(channels, 1).contiguous(memory_format=torch.channels_last)
+
+
+def channel_names(planes: Sequence[str], orientations: int) -> list[tuple[str, int]]:
+    """List the channels of :func:`input_channels` for A orientations, as (plane, which)."""
+    counts = [("paper", 4), *((name, PLANES[name].channels(orientations)) for name in planes)]
+    return [(name, k) for name, count in counts for k in range(count)]

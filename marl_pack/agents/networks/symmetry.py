@@ -1,0 +1,170 @@
+"""The bin's symmetries: how observations and actions move, and agents asked in all of them.
+
+Mirroring the bin along x or y and, where W = D, exchanging x and y change nothing in the game: a
+box placed in the mirrored bin stands as it did. What describes a placement lies at the low corner
+of its window, which moves with the item's sides; exchanging x and y also exchanges orientations o
+and o ^ 1. How a tensor of an observation moves follows from its shape
+(:mod:`marl_pack.agents.networks.planes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.networks.actor_critic import Actor
+from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind
+from marl_pack.agents.networks.planes import Observation
+from marl_pack.bins import oriented
+from marl_pack.game.moves import Floor
+
+
+def count(width: int, depth: int) -> int:
+    """Count the symmetries of a W × D bin, the one that changes nothing included."""
+    return 8 if width == depth else 4
+
+
+def mean_probabilities(actor: Actor, observation: Observation, agent: str) -> Tensor:
+    """Average the probability of each action over the bin's symmetries, float32 [G, K].
+
+    The actor judges the same decision as often as the bin has symmetries. Where items have their
+    centre of mass off centre, or o may be chosen but not o ^ 1, a mirrored state is only nearly one
+    of the game; what is legal stays what the game says.
+
+    Args:
+        actor: the agent's network.
+        observation: of the agent.
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+    """
+    mask, item = observation["mask"], observation["item"]
+    shape = observation["heightmap"].shape[1:]
+    actions = torch.arange(mask.shape[1], device=mask.device).expand(len(mask), -1)
+    total = torch.zeros(mask.shape, device=mask.device)
+    kinds = count(*shape)
+    for kind in range(kinds):
+        symmetry = torch.full((len(mask),), kind, device=mask.device)
+        log_probs = actor.log_probs(mirror_observation(observation, agent, symmetry))
+        total += log_probs.exp().gather(1, mirror_actions(actions, item, shape, agent, symmetry))
+    return total / kinds
+
+
+def transform(
+    observation: Observation, actions: Tensor, agent: str, symmetry: Tensor
+) -> tuple[Any, Tensor]:
+    """Return observations and actions of B games after each one's symmetry.
+
+    Args:
+        observation: of the agent.
+        actions: float or int [B, 1], the agent's actions.
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+        symmetry: int64 [B], bits: 1 mirrors x, 2 mirrors y, then 4 exchanges x and y (W = D).
+
+    Returns:
+        The same tensors, and the actions that place the items in the same, now mirrored, places.
+    """
+    shape = observation["heightmap"].shape[1:]
+    mirrored = mirror_actions(actions.long(), observation["item"], shape, agent, symmetry)
+    return mirror_observation(observation, agent, symmetry), mirrored.to(actions.dtype)
+
+
+def _exchanged(swap: Tensor, a: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (a, c), or (c, a) in the games that are exchanged."""
+    wide = swap.view(-1, *[1] * (a.dim() - 1))
+    return torch.where(wide, c, a), torch.where(wide, a, c)
+
+
+def _mirrored(low: Tensor, side: Tensor | int, length: int, flip: Tensor) -> Tensor:
+    """Return where low corners lie in a mirrored bin; positions that never fit stay in range."""
+    return torch.where(flip, (length - side - low) % length, low)
+
+
+def _bits(symmetry: Tensor) -> Iterator[Tensor]:
+    return ((symmetry >> bit & 1).bool() for bit in range(3))
+
+
+def _judged_sides(item: Tensor, kind: AgentKind) -> Tensor:
+    """Return the sides of the item in the A orientations that the agent judges, [B, A, 3]."""
+    return item[:, None] if kind.orientations == 1 else oriented(item)
+
+
+def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -> Any:
+    """Return the observations of :func:`transform`."""
+    kind = AGENT_KINDS[agent]
+    flip_x, flip_y, swap = _bits(symmetry)
+    heightmap, item = observation["heightmap"], observation["item"]
+    size, (width, depth) = len(heightmap), heightmap.shape[1:]
+    device = heightmap.device
+    b = torch.arange(size, device=device)
+    x, y = torch.arange(width, device=device), torch.arange(depth, device=device)
+    sides = _judged_sides(item, kind)
+
+    # The maps are read backwards: the new map's cell (x, y) shows an old one's. Undo the exchange
+    # first, then the mirrors.
+    from_x, from_y = _exchanged(
+        swap,
+        x[None, :, None].expand(size, width, depth),
+        y[None, None, :].expand(size, width, depth),
+    )
+    old_cell = (
+        b[:, None, None],
+        _mirrored(from_x, 1, width, flip_x[:, None, None]),
+        _mirrored(from_y, 1, depth, flip_y[:, None, None]),
+    )
+    orientation = torch.arange(kind.orientations, device=device).expand(size, -1)
+    if kind.orientations > 1:
+        orientation = torch.where(swap[:, None], orientation ^ 1, orientation)
+    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))  # of the old one
+    wide_x, wide_y = (flip[:, None, None, None] for flip in (flip_x, flip_y))
+    old_x = _mirrored(from_x[:, None], side[..., 0, None, None], width, wide_x)
+    old_y = _mirrored(from_y[:, None], side[..., 1, None, None], depth, wide_y)
+
+    def placements(values: Tensor) -> Tensor:
+        return values[b[:, None, None, None], orientation[..., None, None], old_x, old_y]
+
+    mirrored = dict(observation.items())
+    for name, values in mirrored.items():
+        if values.dim() == 4:
+            mirrored[name] = placements(values)
+        elif values.dim() == 3:
+            mirrored[name] = values[old_cell]
+    mask = mirrored["mask"]
+    if kind.acts_on_cells:
+        by_cell = mask.view(size, kind.orientations, width, depth)
+        mirrored["mask"] = placements(by_cell).flatten(1)
+    else:
+        mirrored["mask"] = mask.gather(1, orientation)
+    if kind.orientations == 1:
+        exchanged = torch.stack((item[:, 1], item[:, 0], item[:, 2]), 1)
+        mirrored["item"] = torch.where(swap[:, None], exchanged, item)
+    if isinstance(observation, dict):
+        return mirrored
+    container: Any = type(observation)  # a TensorDict
+    return container(mirrored, observation.batch_size)  # type: ignore[attr-defined]  # likewise
+
+
+def mirror_actions(
+    actions: Tensor, item: Tensor, shape: Sequence[int], agent: str, symmetry: Tensor
+) -> Tensor:
+    """Return the actions of :func:`transform`, any number for each game, int64 [B, K]."""
+    # Actions are carried forwards: mirrors first, then the exchange.
+    kind = AGENT_KINDS[agent]
+    flip_x, flip_y, swap = (bit[:, None] for bit in _bits(symmetry))
+    if not kind.acts_on_cells:
+        return torch.where(swap, actions ^ 1, actions)
+    width, depth = shape
+    floor = Floor(width, depth)
+    orientation, cell = floor.split(actions)
+    x, y = floor.corner(cell)
+    sides = _judged_sides(item, kind)
+    own = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))
+    new_x, new_y = _exchanged(
+        swap.squeeze(1),
+        _mirrored(x, own[..., 0], width, flip_x),
+        _mirrored(y, own[..., 1], depth, flip_y),
+    )
+    if kind.orientations > 1:
+        orientation = torch.where(swap, orientation ^ 1, orientation)
+    return floor.pair(orientation, floor.cell(new_x, new_y))

@@ -1,0 +1,192 @@
+"""The settings of a training run: typed, each with its meaning.
+
+The docstrings are what ``python -m marl_pack.train --help`` shows; ``configs/rs.yaml`` holds every
+key with its default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from marl_pack.agents.networks.trunk import Network
+from marl_pack.game.spec import GameSpec, document
+from marl_pack.items import DEFAULT_SIDES
+
+
+@document(" " * 8)
+@dataclass(frozen=True)
+class Game(GameSpec):
+    """The packing game (docs/environment.md).
+
+    Args:
+        {options}
+        items: what the conveyor brings: rs, cut1, cut2, or a file of sequences (.npz, .json, .csv).
+        sides: shortest and longest side of generated items, in cells.
+    """
+
+    items: str = "rs"
+    sides: tuple[int, int] = DEFAULT_SIDES
+
+    def __post_init__(self) -> None:
+        """Check every option, naming the section too."""
+        try:
+            super().__post_init__()
+        except ValueError as error:
+            raise ValueError(f"game: {error}") from None
+
+
+@dataclass
+class Agent:
+    """One of the two agents.
+
+    Args:
+        frozen: whether it plays without learning.
+        policy: who plays a frozen agent: random, dblf, height_min, best_fit, max_feasible, for the
+            orientation agent also first (as the item comes), or a run's folder or checkpoint.
+        network: shape of its network.
+        teacher: the agent whose choices it clones at first, as for policy; null for none.
+        teacher_iterations: for how many iterations it clones the teacher.
+        learning_rate: the agent's own, in place of ppo.learning_rate; null for that.
+        entropy_coef: the agent's own, in place of ppo.entropy_coef; null for that.
+        final_entropy_coef: the agent's own, in place of ppo.final_entropy_coef; null for that.
+    """
+
+    frozen: bool = False
+    policy: str | None = None
+    network: Network = field(default_factory=Network)
+    teacher: str | None = None
+    teacher_iterations: int = 0
+    learning_rate: float | None = None
+    entropy_coef: float | None = None
+    final_entropy_coef: float | None = None
+
+
+@dataclass
+class PPO:
+    """Proximal policy optimization, by the names that rsl_rl gives these.
+
+    Args:
+        num_envs: bins played at once (by each process).
+        num_steps_per_env: items placed in each bin between two updates.
+        max_iterations: updates in all; a run sees num_envs * num_steps_per_env * max_iterations
+            items (times the number of processes).
+        num_learning_epochs: passes over the items of one iteration.
+        num_mini_batches: minibatches in each pass.
+        gamma: discount of the reward, per item.
+        lam: lambda of the generalised advantage estimate.
+        clip_param: largest change of an action's probability, relative, that is rewarded.
+        value_loss_coef: weight of the critic's loss.
+        use_clipped_value_loss: whether the critic's change is clipped by clip_param as well.
+        entropy_coef: bonus for the entropy of the actions, at the start.
+        final_entropy_coef: that bonus at the end, linear between; null for no change.
+        learning_rate: step size of the optimiser, at the start.
+        schedule: learning rate over the run: fixed; linear, down to 0 at the end; or adaptive, by
+            the KL divergence.
+        desired_kl: KL divergence of an update that the adaptive schedule aims at.
+        max_grad_norm: longest gradient of the actor, and of the critic.
+        normalize_advantage_per_mini_batch: normalise advantages there, not over the iteration.
+        optimizer: the optimiser, one of torch's.
+        symmetry: show each sample to the update through a random symmetry of the bin.
+    """
+
+    num_envs: int = 256
+    num_steps_per_env: int = 16
+    max_iterations: int = 300
+    num_learning_epochs: int = 2
+    num_mini_batches: int = 32
+    gamma: float = 1.0
+    lam: float = 0.96
+    clip_param: float = 0.2
+    value_loss_coef: float = 0.5
+    use_clipped_value_loss: bool = False
+    entropy_coef: float = 0.005
+    final_entropy_coef: float | None = None
+    learning_rate: float = 7e-4
+    schedule: Literal["fixed", "linear", "adaptive"] = "linear"
+    desired_kl: float = 0.01
+    max_grad_norm: float = 1.0
+    normalize_advantage_per_mini_batch: bool = False
+    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    symmetry: bool = False
+
+
+@dataclass
+class Evaluation:
+    """Evaluation during training: the most probable actions, on generated sequences held out.
+
+    Args:
+        every: iterations between evaluations (and one at the end); 0 for none at all.
+        episodes: how many sequences.
+        seed: seed of those sequences; training draws others.
+    """
+
+    every: int = 20
+    episodes: int = 1000
+    seed: int = 2024
+
+
+@dataclass
+class Output:
+    """Where the run is kept.
+
+    Args:
+        folder: where the runs' folders are made.
+        name: name of the run's folder; null for one made of the date and time.
+        logger: where scalars go: tensorboard, or wandb (which keeps TensorBoard's files as well).
+        wandb_project: the project on Weights & Biases.
+        latest_every: iterations between checkpoints to resume from.
+        keep_every: iterations between checkpoints that are all kept.
+    """
+
+    folder: str = "runs"
+    name: str | None = None
+    logger: Literal["tensorboard", "wandb"] = "tensorboard"
+    wandb_project: str = "marl_pack"
+    latest_every: int = 5
+    keep_every: int = 100
+
+
+@dataclass
+class Config:
+    """A training run.
+
+    Args:
+        seed: seed of weights, actions and items.
+        device: where everything happens: cpu, cuda, or cuda:1; with torchrun, cuda means each
+            process's own GPU.
+        threads: threads on the CPU.
+        joint: one agent that chooses the pair (orientation, cell) in place of the two; its network
+            is placement.network.
+        init: a run's folder or checkpoint whose weights the learning agents begin with; null for
+            fresh ones.
+        game: the game.
+        orientation: the agent that chooses the orientation.
+        placement: the agent that places the item.
+        ppo: how they learn.
+        evaluation: evaluation during training.
+        output: where the run is kept.
+    """
+
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    joint: bool = False
+    init: str | None = None
+    game: Game = field(default_factory=Game)
+    orientation: Agent = field(default_factory=Agent)
+    placement: Agent = field(default_factory=Agent)
+    ppo: PPO = field(default_factory=PPO)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    output: Output = field(default_factory=Output)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as plain lists, dicts and values."""
+        plain: dict[str, Any] = _plain(asdict(self))
+        return plain
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

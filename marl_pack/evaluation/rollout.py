@@ -1,0 +1,65 @@
+"""Play policies on games to their end, many at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_pack.agents.policy import Policy
+from marl_pack.game.packing import Packing
+from marl_pack.plan import Plan
+
+BATCH = 1024  # bins played at once, at most
+BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Packings of E episodes, and the time that playing them took."""
+
+    plans: list[Plan]  # E plans in the order of episodes
+    seconds: float  # spent in the game and the policy
+
+    @property
+    def utilization(self) -> NDArray[np.float64]:
+        """Share of the volume of the bins that is filled in each episode, [E]."""
+        return np.array([plan.utilization for plan in self.plans])
+
+    @property
+    def packed(self) -> NDArray[np.int64]:
+        """Number of boxes packed in each episode, [E]."""
+        return np.array([len(plan) for plan in self.plans], np.int64)
+
+
+def play(
+    policy: Policy,
+    game: Callable[[int, int], Packing],
+    episodes: int,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Rollout:
+    """Play episodes 0 … episodes - 1 to their end.
+
+    Args:
+        policy: of both agents.
+        game: (n, first_episode) -> a game of n bins without ``auto_reset``.
+        episodes: how many, E.
+        progress: called with the number of episodes that have just ended.
+    """
+    plans: list[Plan] = []
+    width, depth, _ = game(1, 0).size
+    batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))
+    seconds = 0.0
+    for first in range(0, episodes, batch):
+        table = game(min(batch, episodes - first), first)
+        progress(int((~table.alive).sum()))
+        start = time.perf_counter()
+        while bool(table.alive.any()):
+            outcome = table.place(*policy(table))
+            progress(int(outcome.done.sum()))
+        seconds += time.perf_counter() - start
+        plans += table.plans()
+    return Rollout(plans, seconds)

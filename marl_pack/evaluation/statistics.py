@@ -1,0 +1,97 @@
+"""Compute figures of packings: utilization with its interval, equilibrium, and falls in physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from marl_pack.evaluation.rollout import Rollout
+from marl_pack.plan import Plan
+from marl_pack.sapien_check.bodies import Bodies
+from marl_pack.sapien_check.judge import judge_all
+from marl_pack.stability import in_equilibrium
+
+
+def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
+    """Compute the 95 % interval of the mean (Student's t); None for a single value."""
+    if len(values) < 2:
+        return None
+    if np.ptp(values) == 0:  # Student's would be NaN
+        return float(values[0]), float(values[0])
+    bounds = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    return float(bounds.low), float(bounds.high)
+
+
+def mean_utilization(rollout: Rollout) -> dict[str, Any]:
+    """Compute mean utilization with its 95 % interval over episodes, and items packed.
+
+    Keys ``episodes``, ``utilization``, ``low``, ``high``, ``std``, ``packed``; shares of the bin's
+    volume. A single episode has no interval and no standard deviation (None).
+    """
+    utilization = rollout.utilization
+    low, high = interval(utilization) or (None, None)
+    return {
+        "episodes": len(utilization),
+        "utilization": float(utilization.mean()),
+        "low": low,
+        "high": high,
+        "std": float(utilization.std(ddof=1)) if len(utilization) > 1 else None,
+        "packed": float(rollout.packed.mean()),
+    }
+
+
+def summary(rollout: Rollout, balanced: NDArray[np.bool_]) -> dict[str, Any]:
+    """Compute the figures of one row of evaluate's table.
+
+    Args:
+        rollout: the packings.
+        balanced: bool [E], whether each is in strict equilibrium.
+    """
+    figures = mean_utilization(rollout)
+    low, high = figures.pop("low"), figures.pop("high")
+    return {
+        **figures,
+        "interval": None if low is None else [low, high],
+        "decisions_per_second": float(rollout.packed.sum() / max(rollout.seconds, 1e-9)),
+        "strict_equilibrium": float(balanced.mean()),
+    }
+
+
+def strict_equilibrium(plan: Plan) -> bool:
+    """Return whether the stack in every bin is in strict static equilibrium as a whole (HiGHS).
+
+    Raises:
+        ValueError: if lengths are no whole numbers, which the contacts of faces need.
+    """
+    if plan.sides.dtype.kind != "i":
+        raise ValueError("the plan has fractions of a unit: scale it to whole numbers")
+    bins = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
+    return all(in_equilibrium(own.boxes, own.loads) for own in bins)
+
+
+def falls(
+    plans: Sequence[Plan],
+    bodies: Bodies,
+    processes: int = 1,
+    progress: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:
+    """Judge every packing in physics, after each placement up to its first fall.
+
+    Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
+    judged), ``judged`` (placements) and ``judge_seconds`` (of one placement).
+    """
+    judged = []
+    for one in judge_all(bodies.stacks(plans, range(len(plans))), processes=processes):
+        judged.append(one)
+        progress()
+    placements = sum(one.placements for one in judged)
+    return {
+        "falls": sum(one.fall is not None for one in judged),
+        "no_verdict": sum(one.error is not None for one in judged),
+        "judged": placements,
+        "judge_seconds": sum(one.seconds for one in judged) / max(placements, 1),
+    }

@@ -1,0 +1,147 @@
+"""The legal actions of a game: which orientation, and which cell of the floor.
+
+A placement is a pair of an orientation o (0 … 5) and a cell, the low corner (x, y) of the box,
+numbered ``x · D + y``. The pair itself is numbered ``o · W · D + cell``. This module is the only
+place that knows these numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from marl_pack.backend import Backend
+from marl_pack.geometry import ORIENTATIONS
+
+Numbers = TypeVar("Numbers", int, Tensor, NDArray[np.int64])
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The numbers of cells and of pairs on a floor of W × D cells.
+
+    All functions take whole numbers, arrays or tensors, and return the same kind.
+    """
+
+    width: int  # W
+    depth: int  # D
+
+    @property
+    def cells(self) -> int:
+        """Number of cells W · D."""
+        return self.width * self.depth
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of an orientation and a cell."""
+        return len(ORIENTATIONS) * self.cells
+
+    def cell(self, x: Numbers, y: Numbers) -> Numbers:
+        """Return the number of the cell (x, y)."""
+        return x * self.depth + y
+
+    def corner(self, cell: Numbers) -> tuple[Numbers, Numbers]:
+        """Return x and y of cells."""
+        return cell // self.depth, cell % self.depth
+
+    def corners(self, cell: Tensor, backend: Backend) -> Tensor:
+        """Return the low corners (x, y) of cells int64 [N], as int64 [N, 2]."""
+        code = backend.pick(compiled=_corners_compiled, tensor=_corners_tensor)
+        return code(cell, self.depth)
+
+    def pair(self, orientation: Numbers, cell: Numbers) -> Numbers:
+        """Return the number of pairs (orientation, cell)."""
+        return orientation * self.cells + cell
+
+    def split(self, pair: Numbers) -> tuple[Numbers, Numbers]:
+        """Return orientation and cell of pairs."""
+        return pair // self.cells, pair % self.cells
+
+    def nearest(self, cell: int, legal: NDArray[np.int64]) -> int:
+        """Return the cell of ``legal`` (int64 [K], K ≥ 1) that is nearest to ``cell``."""
+        (x, y), (legal_x, legal_y) = self.corner(cell), self.corner(legal)
+        return int(legal[np.hypot(legal_x - x, legal_y - y).argmin()])
+
+
+@dataclass(frozen=True)
+class Moves:
+    """The legal placements of the visible items of G games, one flag an orientation and cell."""
+
+    mask: Tensor  # bool [G, 6, W, D]
+
+    @property
+    def floor(self) -> Floor:
+        """The numbers of cells and pairs."""
+        return Floor(self.mask.shape[2], self.mask.shape[3])
+
+    @property
+    def orientations(self) -> Tensor:
+        """Bool [G, 6]: the orientations with a legal cell."""
+        # A sum is many times faster than ``any`` on the CPU.
+        return self.mask.sum((2, 3), dtype=torch.int32) > 0
+
+    def any(self) -> Tensor:
+        """Return whether there is a legal placement at all, bool [G]."""
+        return self.orientations.any(1)
+
+    def of(self, orientation: Tensor) -> Tensor:
+        """Return the legal cells bool [G, W, D] of one orientation (int64 [G]) for each game."""
+        return self.gather(self.mask, orientation)
+
+    def only(self, orientation: Tensor) -> Moves:
+        """Return the moves that use one orientation (int64 [G]) for each game."""
+        chosen = torch.nn.functional.one_hot(orientation, len(ORIENTATIONS)).bool()
+        return Moves(self.mask & chosen[:, :, None, None])
+
+    def allows(self, orientation: Tensor, cell: Tensor) -> Tensor:
+        """Return whether placements (int64 [G] each) are legal, bool [G]; out of range is not."""
+        floor = self.floor
+        pair = floor.pair(orientation, cell)
+        near = pair.clamp(0, floor.pairs - 1)
+        legal = self.mask.flatten(1).gather(1, near[:, None]).squeeze(1)
+        return legal & (near == pair) & (cell >= 0) & (cell < floor.cells)
+
+    def least(self, key: Tensor) -> tuple[Tensor, Tensor]:
+        """Return orientation and cell of the least key [G, 6, W, D], the first of equals.
+
+        Returns:
+            int64 [G] each; legal wherever there is a legal placement.
+        """
+        barred = torch.inf if key.is_floating_point() else torch.iinfo(key.dtype).max
+        return self.floor.split(torch.where(self.mask, key, barred).flatten(1).argmin(1))
+
+    @staticmethod
+    def gather(values: Tensor, orientation: Tensor, cell: Tensor | None = None) -> Tensor:
+        """Return the values [G, 6, …] of one orientation, and of one cell if given, of each game.
+
+        Args:
+            values: [G, 6, …], or [G, 6, W, D] if a cell is given.
+            orientation: int64 [G].
+            cell: int64 [G].
+        """
+        games = torch.arange(len(values), device=values.device)
+        if cell is None:
+            return values[games, orientation]
+        return values[games, orientation].flatten(1)[games, cell]
+
+
+@njit(cache=True)
+def _write_corners(cells: Any, depth: int, corners: Any) -> None:
+    for k in range(cells.size):
+        corners[k, 0], corners[k, 1] = cells[k] // depth, cells[k] % depth
+
+
+def _corners_compiled(cells: Tensor, depth: int) -> Tensor:
+    corners = np.empty((len(cells), 2), np.int64)
+    _write_corners(cells.numpy(), depth, corners)
+    return torch.from_numpy(corners)
+
+
+def _corners_tensor(cells: Tensor, depth: int) -> Tensor:
+    return torch.stack((cells // depth, cells % depth), 1)

@@ -1,0 +1,269 @@
+"""The options of a game, each listed once: :class:`GameSpec`.
+
+Settings files, command lines, the PettingZoo environment, checkpoints and the words that describe
+a game derive from the fields of this record. A new option is one field here and the code that uses
+it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from numbers import Real
+from typing import Any, TypeVar
+
+from marl_pack import renamed
+from marl_pack.bins import check_size
+from marl_pack.items.items import ALL_ORIENTATIONS
+from marl_pack.stability import RULES, Rule, make_rule
+from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset
+from marl_pack.stability.support_area import THRESHOLDS
+
+T = TypeVar("T")
+
+
+def _option(
+    default: Any,
+    sentence: str,
+    check: Callable[[Any], Any],
+    phrase: Callable[[Any], str],
+    **argument: Any,
+) -> Any:
+    """Return the field of one option.
+
+    Args:
+        default: its value unless another is given.
+        sentence: what it does, with its range.
+        check: returns the value in its right type; raises ValueError saying what would be right.
+        phrase: the value in the words that describe a game.
+        **argument: of ``argparse.add_argument``, beside its name and its help; with ``flag`` in
+            place of the name where that differs.
+    """
+    metadata = {"sentence": sentence, "check": check, "phrase": phrase, "argument": argument}
+    return field(default=default, metadata=metadata)
+
+
+def _rule(value: Any) -> Any:
+    if callable(value) or (isinstance(value, str) and value in RULES):
+        return value
+    raise ValueError(f"unknown stability rule {value!r}: one of {', '.join(RULES)}")
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        raise ValueError(f"{value!r}: needs a finite number")
+    return float(value)
+
+
+def _margin(value: Any) -> float | None:
+    if value is not None and _number(value) < 0:
+        raise ValueError(f"{value!r}: needs a number of cells ≥ 0")
+    return None if value is None else float(value)
+
+
+def _thresholds(value: Any) -> str | None:
+    if value is not None and value not in THRESHOLDS:
+        raise ValueError(f"{value!r}: one of {', '.join(THRESHOLDS)}")
+    return None if value is None else str(value)
+
+
+def _orientations(value: Any) -> tuple[int, ...]:
+    chosen = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    whole = all(isinstance(o, int) and not isinstance(o, bool) for o in chosen)
+    if not chosen or not whole or not set(chosen) <= set(ALL_ORIENTATIONS):
+        raise ValueError(f"{value!r}: need one or more of 0 … 5")
+    return tuple(sorted(set(chosen)))
+
+
+def _switch(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{value!r}: needs true or false")
+    return value
+
+
+def _max_items(value: Any) -> int | None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ValueError(f"{value!r}: needs a whole number ≥ 1, or none for no limit")
+    return value
+
+
+def _rule_name(rule: Any) -> str:
+    """Return the name of a rule, whether it is named or bound."""
+    return rule if isinstance(rule, str) else getattr(getattr(rule, "func", rule), "__name__", "?")
+
+
+@dataclass(frozen=True)
+class GameSpec:
+    """Every option of a packing game.
+
+    Not among them: where items come from, the device, the seed, and whether episodes restart by
+    themselves (:class:`marl_pack.game.packing.Packing` takes those).
+
+    Args:
+        {options}
+    """
+
+    bin: tuple[int, int, int] = _option(
+        (10, 10, 10), "size W, D, H of the bin, in cells.", check_size,
+        lambda bin: f"bin {' x '.join(map(str, bin))}",
+        nargs=3, type=int, metavar=("W", "D", "H"),
+    )  # fmt: skip
+    rule: Any = _option(  # noqa: RUF009  # the default is a name
+        "hull_alpha",
+        f"stability rule of the masks, one of {', '.join(RULES)} (in Python also a function).",
+        _rule, lambda rule: f"rule {_rule_name(rule)}", choices=list(RULES),
+    )  # fmt: skip
+    margin: float | None = _option(
+        None, "cells by which the support polygon is shrunk, 0 or more; null for none.", _margin,
+        lambda margin: f"margin {margin:g}", type=float,
+    )  # fmt: skip
+    thresholds: str | None = _option(
+        None,
+        f"thresholds of the rule area_ratio, {' or '.join(THRESHOLDS)}; null for its default.",
+        _thresholds, lambda thresholds: f"thresholds {thresholds}", choices=list(THRESHOLDS),
+    )  # fmt: skip
+    orientations: tuple[int, ...] = _option(
+        ALL_ORIENTATIONS, "indices of the orientations that may be chosen, of 0 to 5.",
+        _orientations, lambda chosen: f"orientations {' '.join(map(str, chosen))}",
+        nargs="+", type=int, metavar="O",
+    )  # fmt: skip
+    mask_orientations: bool = _option(
+        True, "whether orientations without a stable cell are excluded; else choosing one ends the "
+        "episode.", _switch, lambda masked: "" if masked else "no mask of orientations",
+        flag="orientation-mask", action=argparse.BooleanOptionalAction,
+    )  # fmt: skip
+    alpha: float = _option(
+        1.0, "weight of the volume gained in the reward (Eq. 5).", _number,
+        lambda alpha: f"alpha {alpha:g}", type=float,
+    )  # fmt: skip
+    beta: float = _option(
+        1.0, "weight of the space wasted in the reward (Eq. 5).", _number,
+        lambda beta: f"beta {beta:g}", type=float,
+    )  # fmt: skip
+    com_offset: tuple[float, float, float] = _option(
+        NO_OFFSET, "centre of mass of the items from their middle, in fractions of w, d, h.",
+        check_com_offset,
+        lambda offset: f"centre of mass off by {' '.join(f'{o:g}' for o in offset)}",
+        nargs=3, type=float, metavar=("X", "Y", "Z"),
+    )  # fmt: skip
+    max_items: int | None = _option(
+        None, "most items that a bin may hold, 1 or more; the episode ends there; null for no "
+        "limit.", _max_items, lambda most: f"at most {most} items", type=int,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        """Check every option.
+
+        Raises:
+            ValueError: naming the option and what would be right.
+        """
+        for option in fields(GameSpec):
+            value = getattr(self, option.name)
+            try:
+                object.__setattr__(self, option.name, option.metadata["check"](value))
+            except (ValueError, TypeError) as error:
+                named = option.name in str(error)
+                raise ValueError(str(error) if named else f"{option.name} = {error}") from None
+        self.make_rule()
+
+    def make_rule(self) -> Rule:
+        """Return the stability rule with its parameters bound.
+
+        Raises:
+            ValueError: for a parameter that the rule does not take.
+        """
+        bound = {"margin": self.margin, "thresholds": self.thresholds}
+        parameters = {name: value for name, value in bound.items() if value is not None}
+        if isinstance(self.rule, str):
+            return make_rule(self.rule, **parameters)
+        if parameters:
+            raise ValueError(
+                f"{', '.join(parameters)}: goes with the name of a rule, not with a bound one"
+            )
+        rule: Rule = self.rule
+        return rule
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> GameSpec:
+        """Return the spec with the options that ``values`` holds; other keys are left out.
+
+        Args:
+            values: such as the section ``game`` of a run's settings.
+        """
+        names = {option.name for option in fields(GameSpec)}
+        return GameSpec(**{key: value for key, value in values.items() if key in names})
+
+    def with_options(self, options: Mapping[str, Any]) -> GameSpec:
+        """Return the spec with some options changed.
+
+        Raises:
+            TypeError: for a name that is no option, with the nearest one.
+            ValueError: for a value that cannot be, or an old name.
+        """
+        names = [option.name for option in fields(GameSpec)]
+        for name in options:
+            renamed.refuse_old(name, renamed.OPTIONS, "option")
+            if name not in names:
+                near = difflib.get_close_matches(name, names, 1)
+                guess = f"; did you mean {near[0]!r}?" if near else ""
+                raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
+        return replace(self, **options) if options else self
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options by name, a bound rule by its function's name."""
+        return asdict(self) | {"rule": _rule_name(self.rule)}
+
+    def phrases(self) -> list[str]:
+        """Describe the bin, the rule, and every other option that is not at its default."""
+        return [
+            option.metadata["phrase"](getattr(self, option.name))
+            for option in fields(GameSpec)
+            if option.name in ("bin", "rule") or getattr(self, option.name) != option.default
+        ]
+
+    def __str__(self) -> str:
+        """Describe the game, such as ``bin 10 x 10 x 10, rule hull_alpha, margin 1``."""
+        return ", ".join(self.phrases())
+
+
+def document(indent: str) -> Callable[[T], T]:
+    """Return a decorator that lists the options where a docstring says ``{options}``.
+
+    Args:
+        indent: white space before each option's name.
+    """
+    lines = "\n".join(
+        textwrap.fill(
+            f"{option.name}: {option.metadata['sentence']}", 100, initial_indent=indent,
+            subsequent_indent=f"{indent}    ", break_on_hyphens=False,
+        )
+        for option in fields(GameSpec)
+    )  # fmt: skip
+
+    def with_options(documented: T) -> T:
+        documented.__doc__ = (documented.__doc__ or "").replace("{options}", lines.strip())
+        return documented
+
+    return with_options
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add every option to a command, by its name; not given is None."""
+    for option in fields(GameSpec):
+        argument = dict(option.metadata["argument"])
+        flag = argument.pop("flag", option.name.replace("_", "-"))
+        sentence = option.metadata["sentence"].rstrip(".")
+        parser.add_argument(f"--{flag}", dest=option.name, help=sentence, **argument)
+
+
+def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that were given on a command line."""
+    values = {option.name: getattr(arguments, option.name) for option in fields(GameSpec)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+document(" " * 8)(GameSpec)

@@ -1,0 +1,66 @@
+"""Sizes of bins and the six orientations of a box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import cache
+from numbers import Real
+
+import torch
+from torch import Tensor
+
+Size = tuple[int, int, int]
+"""A bin's sides (W, D, H) in cells."""
+
+ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
+    (0, 1, 2),
+    (1, 0, 2),
+    (0, 2, 1),
+    (2, 0, 1),
+    (1, 2, 0),
+    (2, 1, 0),
+)
+"""The six axis permutations of a box: row ``o`` names which of the item's own sides
+(0 = w, 1 = d, 2 = h) lies along x, y and z. ``o // 2`` picks the side that stands upright
+(h, d, w) and ``o ^ 1`` is the same box rotated by 90° about the vertical, so 0 is the item as
+it comes and {0, 1} are the two orientations that keep it upright."""
+
+MAX_HEIGHT = 16383
+"""Height of the tallest bin in cells: masks compare ``2 · height + 1`` as 16-bit integers."""
+MAX_SIDE = 32767
+"""Width and depth of the largest bin in cells."""
+
+
+def _is_number(value: object) -> bool:
+    """Return whether ``value`` is a finite real number, booleans excluded."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    return math.isfinite(float(value))
+
+
+def check_size(size: Size) -> Size:
+    """Return ``size`` as three ints.
+
+    Raises:
+        ValueError: unless it is three whole numbers from 1 to the largest allowed.
+    """
+    sides = tuple(size) if isinstance(size, Iterable) else ()
+    if len(sides) != 3 or any(not _is_number(s) or int(s) != s or s < 1 for s in sides):
+        raise ValueError(f"bin size {size!r}: needs three whole numbers of cells ≥ 1, W D H")
+    if sides[2] > MAX_HEIGHT or max(sides) > MAX_SIDE:
+        raise ValueError(
+            f"bin size {size!r}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger cells"
+        )
+    return int(sides[0]), int(sides[1]), int(sides[2])
+
+
+@cache
+def orientation_table(device: torch.device) -> Tensor:
+    """Return :data:`ORIENTATIONS` as int64 [6, 3] on ``device``."""
+    return torch.tensor(ORIENTATIONS, device=device)
+
+
+def oriented(items: Tensor) -> Tensor:
+    """Return the items' sides (w, d, h) [..., 3] in their six orientations [..., 6, 3]."""
+    return items[..., orientation_table(items.device)]

@@ -1,0 +1,169 @@
+"""Windows and placements of boxes in batched tensor code, for any device.
+
+:mod:`marl_pack.geometry.compiled` has the same operations as compiled loops. A batch of B maps has
+a window of its own for each map.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def footprint(width: int, depth: int, sides: Tensor, corners: Tensor) -> Tensor:
+    """Return the columns under boxes, bool [N, W, D].
+
+    Args:
+        width: W.
+        depth: D.
+        sides: int [N, 3], the boxes' sides along x, y, z.
+        corners: int64 [N, 2], their low corners (x, y).
+    """
+    far = corners + sides[:, :2]
+    rows = torch.arange(width, device=sides.device)
+    columns = torch.arange(depth, device=sides.device)
+    in_x = (rows >= corners[:, :1]) & (rows < far[:, :1])
+    in_y = (columns >= corners[:, 1:]) & (columns < far[:, 1:])
+    return in_x[:, :, None] & in_y[:, None, :]
+
+
+def place_boxes(
+    heightmap: Tensor, empty_map: Tensor, under: Tensor, heights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Place one box on each map from above, in place (Algorithm 2 for the empty map).
+
+    Each box comes to rest on the highest column below it.
+
+    Args:
+        heightmap: int16 [N, W, D], the top of each column.
+        empty_map: int16 [N, W, D], the empty cells below each top.
+        under: bool [N, W, D], the columns under each box (:func:`footprint`).
+        heights: int [N], the boxes' sides along z.
+
+    Returns:
+        Resting heights int16 [N] and wasted cells int64 [N] (v_waste of Eq. 7): empty cells
+        enclosed below each box.
+    """
+    resting_height = torch.where(under, heightmap, 0).flatten(1).amax(1)
+    gap = torch.where(under, resting_height[:, None, None] - heightmap, 0)
+    empty_map.add_(gap)
+    top = (resting_height + heights).to(heightmap.dtype)
+    heightmap.copy_(torch.where(under, top[:, None, None], heightmap))
+    return resting_height, gap.flatten(1).sum(1)
+
+
+def shift(values: Tensor, steps: Tensor, dim: int) -> Tensor:
+    """Return ``values`` [B, W, D] read ``steps`` [B] further along ``dim``, the edge repeated."""
+    length = values.shape[dim]
+    index = torch.arange(length, device=values.device) + steps[:, None]
+    index = index.clamp(0, length - 1)
+    index = index[:, :, None] if dim == 1 else index[:, None, :]
+    return values.gather(dim, index.expand_as(values))
+
+
+def slide(values: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Compute the maximum over the w × d window with its low corner at each cell, by doubling.
+
+    Args:
+        values: [B, W, D].
+        w: int64 [B], the windows' cells along x, ≥ 1.
+        d: int64 [B], the windows' cells along y, ≥ 1.
+
+    Returns:
+        [B, W, D]; correct wherever the window lies inside the map.
+    """
+    for extent, dim in ((d, 2), (w, 1)):
+        longest = int(extent.max()) if extent.numel() else 0
+        reach = 1
+        while reach < longest:
+            step = torch.clamp(extent - reach, min=0, max=reach)
+            values = torch.maximum(values, shift(values, step, dim))
+            reach *= 2
+    return values
+
+
+def fits(sides: Tensor, width: int, depth: int) -> Tensor:
+    """Return where a window of ``sides`` [B, 3] lies inside the map, bool [B, W, D].
+
+    A box with a zero side fits nowhere.
+    """
+    x = torch.arange(width, device=sides.device)
+    y = torch.arange(depth, device=sides.device)
+    in_x = x <= (width - sides[:, 0, None])
+    in_y = y <= (depth - sides[:, 1, None])
+    return in_x[:, :, None] & in_y[:, None, :] & (sides > 0).all(1)[:, None, None]
+
+
+def resting_heights(heightmap: Tensor, sides: Tensor) -> Tensor:
+    """Compute the highest column of every window, int16 [N, A, W, D].
+
+    Args:
+        heightmap: int16 [N, W, D].
+        sides: int16 [N, A, 3].
+
+    Returns:
+        int16 [N, A, W, D]; correct wherever the window lies inside the map.
+    """
+    count = sides.shape[1]
+    flat = sides.flatten(0, 1).long().clamp(min=1)
+    highest = slide(heightmap.repeat_interleave(count, 0), flat[:, 0], flat[:, 1])
+    return highest.view(-1, count, *highest.shape[1:])
+
+
+def window_sum(values: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Compute the sum over every window of a map by a summed-area table.
+
+    Args:
+        values: int or bool [N, W, D].
+        w: int64 [N, A, 1, 1], the windows' cells along x.
+        d: int64 [N, A, 1, 1], the windows' cells along y.
+
+    Returns:
+        int64 [N, A, W, D].
+    """
+    n, width, depth = values.shape
+    table = torch.zeros(n, width + 1, depth + 1, dtype=torch.int64, device=values.device)
+    table[:, 1:, 1:] = values.long().cumsum(1).cumsum(2)
+    x = torch.arange(width, device=values.device)[:, None]
+    y = torch.arange(depth, device=values.device)[None, :]
+    far_x, far_y = (x + w).clamp(max=width), (y + d).clamp(max=depth)
+    b = torch.arange(n, device=values.device)[:, None, None, None]
+    return table[b, far_x, far_y] - table[b, x, far_y] - table[b, far_x, y] + table[b, x, y]
+
+
+def wasted_cells(heightmap: Tensor, sides: Tensor, resting_heights: Tensor) -> Tensor:
+    """Compute the empty cells that a box would enclose below it at every cell.
+
+    Args:
+        heightmap: int16 [N, W, D].
+        sides: int16 [N, A, 3].
+        resting_heights: int16 [N, A, W, D].
+
+    Returns:
+        int64 [N, A, W, D]; correct wherever the window lies inside the map.
+    """
+    w, d = sides[..., 0, None, None].long(), sides[..., 1, None, None].long()
+    return w * d * resting_heights - window_sum(heightmap, w, d)
+
+
+def cut_windows(
+    values: Tensor, index: Tensor, x: Tensor, y: Tensor, sides: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Cut windows of different sizes out of maps.
+
+    Args:
+        values: [B, W, D].
+        index: int64 [U], the map of each window.
+        x: int64 [U], its low corner along W.
+        y: int64 [U], its low corner along D.
+        sides: int [U, ≥ 2], its sides w, d.
+
+    Returns:
+        [U, w, d] for the largest w and d, and bool [U, w, d]: which cells belong to the window.
+    """
+    i = torch.arange(int(sides[:, 0].max()), device=values.device)
+    j = torch.arange(int(sides[:, 1].max()), device=values.device)
+    rows = (x[:, None] + i).clamp(max=values.shape[1] - 1)
+    columns = (y[:, None] + j).clamp(max=values.shape[2] - 1)
+    member = (i < sides[:, :1])[:, :, None] & (j < sides[:, 1:2])[:, None, :]
+    return values[index[:, None, None], rows[:, :, None], columns[:, None, :]], member

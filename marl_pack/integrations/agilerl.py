@@ -1,0 +1,73 @@
+"""AgileRL: the masked actor-critic as two networks, and observations that it lets pass.
+
+AgileRL looks for masks in ``info["action_mask"]`` and forgets them when it learns. So the mask
+travels in the observation here, under the name ``legal`` (it refuses ``action_mask`` there), and
+the networks apply it, also when learning.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from agilerl.modules import EvolvableModule
+from gymnasium import spaces
+from torch.distributions import Categorical
+
+from marl_pack.integrations.network import ActorCritic
+
+
+class Masked(EvolvableModule):
+    """An :class:`ActorCritic` as AgileRL wants it.
+
+    Args:
+        agent: name of the agent, ``"orientation_0"`` or ``"placement_0"``.
+        device: where its weights are.
+    """
+
+    def __init__(self, agent: str, device: str = "cpu") -> None:
+        super().__init__(device)
+        self.agent = agent
+        self.network = ActorCritic(agent.partition("_")[0])
+        self.choice: Any = None  # distribution of the last observation's actions
+
+    def outputs(self, observation: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return masked logits [B, n] and values [B]."""
+        logits, values = self.network(observation["observation"], observation["legal"])
+        return logits, values
+
+
+class Actor(Masked):
+    """The network that chooses actions."""
+
+    def forward(self, observation: Any, action_mask: Any = None) -> tuple[torch.Tensor, ...]:
+        """Return actions, their log-probabilities and entropies; each [B]."""
+        self.choice = Categorical(logits=self.outputs(observation)[0])
+        action = self.choice.sample()
+        return action, self.choice.log_prob(action), self.choice.entropy()
+
+    def action_log_prob(self, action: torch.Tensor) -> torch.Tensor:
+        """Return log-probabilities [B] of actions, for the last observation."""
+        log_prob: torch.Tensor = self.choice.log_prob(action)
+        return log_prob
+
+
+class Critic(Masked):
+    """The network that values states."""
+
+    def forward(self, observation: Any) -> torch.Tensor:
+        """Return the values of states, [B, 1]."""
+        return self.outputs(observation)[1][:, None]
+
+
+def legal_space(space: Any) -> spaces.Dict:
+    """Return an agent's observation space with the mask under its new name."""
+    return spaces.Dict({"observation": space["observation"], "legal": space["action_mask"]})
+
+
+def renamed(observations: dict[str, Any]) -> dict[str, Any]:
+    """Return observations as a batch of one, with the mask under its new name."""
+    return {
+        agent: {"observation": own["observation"][None], "legal": own["action_mask"][None]}
+        for agent, own in observations.items()
+    }

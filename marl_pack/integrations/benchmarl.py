@@ -1,0 +1,90 @@
+"""BenchMARL: the environment as a task, and the masked actor-critic as a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+import torch
+from benchmarl.environments.pettingzoo.common import PettingZooClass
+from benchmarl.models.common import Model, ModelConfig
+from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+
+from marl_pack import env_aec
+from marl_pack.integrations.network import ActorCritic
+
+
+class PackingTask(PettingZooClass):
+    """The AEC environment as a task: every agent is a group, with exact masks.
+
+    ``PackingTask("PACKING", {"bin_size": (10, 10, 10)})``: the settings are the options of
+    :func:`marl_pack.env_aec.env`.
+    """
+
+    def make_env(self) -> Any:
+        """Return one new AEC environment."""
+        return env_aec.env(**self.config)
+
+    def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: Any, device: Any) -> Any:
+        """Return a function that makes one environment; each has its own items.
+
+        BenchMARL gives all environments of a task the same seed, so seeds are counted here.
+        """
+        seeds = count(1000 * (seed or 0))
+        return lambda: PettingZooWrapper(
+            self.make_env(), use_mask=True, seed=next(seeds), categorical_actions=True,
+            device=device,
+        )  # fmt: skip
+
+    def supports_discrete_actions(self) -> bool:
+        """Return True: both agents' actions are discrete."""
+        return True
+
+    def max_steps(self, env: Any) -> int:
+        """Return a bound for evaluations; an episode ends by itself."""
+        return 10**6
+
+    def observation_spec(self, env: Any) -> Any:
+        """Return what the model reads: planes, mask of actions, and whether the agent acts."""
+        spec = env.observation_spec.clone()
+        for group in self.group_map(env):
+            del spec[group]["info"]
+        return spec
+
+
+class MaskedModel(Model):
+    """An :class:`ActorCritic` as BenchMARL wants it; as a critic it gives values.
+
+    BenchMARL's losses also run over the turns of the other agent. Logits are constant there, so
+    that no gradient reaches the policy; the critic learns the values of these turns.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self.network = ActorCritic(self.agent_group.partition("_")[0])
+
+    def _forward(self, tensordict: Any) -> Any:
+        """Write logits [..., n] or values [..., 1] into the TensorDict."""
+        group = tensordict[self.agent_group]
+        planes, mask = group["observation", "observation"], group["action_mask"]
+        lead = planes.shape[:-3]
+        logits, values = self.network(
+            planes.reshape(-1, *planes.shape[-3:]), mask.reshape(-1, mask.shape[-1])
+        )
+        if self.is_critic:
+            tensordict[self.out_key] = values.reshape(*lead, 1)
+        else:
+            acts = group["mask"].reshape(*lead, 1)
+            tensordict[self.out_key] = torch.where(acts, logits.reshape(*lead, -1), 0)
+        return tensordict
+
+
+@dataclass
+class MaskedModelConfig(ModelConfig):
+    """Settings of :class:`MaskedModel`: there are none."""
+
+    @staticmethod
+    def associated_class() -> type[Model]:
+        """Return the class of these settings."""
+        return MaskedModel

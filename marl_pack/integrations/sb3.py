@@ -1,0 +1,88 @@
+"""Stable-Baselines3 (sb3-contrib): both agents' turns as those of one, and the masked policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
+from torch import Tensor
+
+from marl_pack.env_aec import AGENTS
+from marl_pack.integrations.network import ActorCritic
+
+
+class Turns(gymnasium.Env[Any, Any]):
+    """Both agents' turns as those of one agent; the reward is the one they share.
+
+    Args:
+        env: an AEC environment with ``pad_actions=True``.
+        seed: of the items; the first reset takes it.
+    """
+
+    def __init__(self, env: Any, seed: int) -> None:
+        self.env = env
+        self.seed: int | None = seed
+        self.observation_space = env.observation_space(AGENTS[0])
+        self.action_space = env.action_space(AGENTS[0])
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin the stream's next episode; return the observation and an empty info."""
+        self.env.reset(seed=self.seed)
+        self.seed = None
+        return self.env.observe(self.env.agent_selection), {}
+
+    def step(self, action: Any) -> Any:
+        """Play the turn of the agent that acts; return what gymnasium's ``step`` does."""
+        agent = self.env.agent_selection
+        self.env.step(int(action))
+        ends = self.env.terminations[agent], self.env.truncations[agent]
+        observation = self.env.observe(self.env.agent_selection)
+        return observation, self.env.rewards[agent], *ends, dict(self.env.infos[agent])
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return the mask that MaskablePPO asks for before each step, bool [n]."""
+        mask: NDArray[np.int8] = self.env.observe(self.env.agent_selection)["action_mask"]
+        return mask.astype(bool)
+
+
+class MaskedPolicy(MaskableMultiInputActorCriticPolicy):
+    """A policy that is one :class:`ActorCritic` for both turns.
+
+    The value of a state is asked for without a mask, so the policy reads it from the observation.
+    """
+
+    def _build(self, lr_schedule: Any) -> None:
+        """Make the network and its optimizer."""
+        self.network = ActorCritic("both")
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr_schedule(1))
+
+    def _outputs(self, obs: Any, action_masks: Any = None) -> tuple[Any, Tensor]:
+        """Return the distribution of actions and values [B, 1]."""
+        logits, values = self.network(obs["observation"].float(), obs["action_mask"])
+        choice = self.action_dist.proba_distribution(action_logits=logits)
+        if action_masks is not None:
+            choice.apply_masking(action_masks)
+        return choice, values[:, None]
+
+    def forward(self, obs: Any, deterministic: bool = False, action_masks: Any = None) -> Any:
+        """Return actions, values and log-probabilities."""
+        choice, values = self._outputs(obs, action_masks)
+        actions = choice.get_actions(deterministic=deterministic)
+        return actions, values, choice.log_prob(actions)
+
+    def evaluate_actions(self, obs: Any, actions: Tensor, action_masks: Any = None) -> Any:
+        """Return values, log-probabilities and entropies of actions."""
+        choice, values = self._outputs(obs, action_masks)
+        return values, choice.log_prob(actions), choice.entropy()
+
+    def get_distribution(self, obs: Any, action_masks: Any = None) -> Any:
+        """Return the actions' distribution."""
+        return self._outputs(obs, action_masks)[0]
+
+    def predict_values(self, obs: Any) -> Tensor:
+        """Return the values of states, [B, 1]."""
+        return self._outputs(obs)[1]

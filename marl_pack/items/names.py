@@ -1,0 +1,66 @@
+"""Names of columns, keys and arrays: unknown ones are refused with the nearest valid name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+SYNONYMS: dict[str, tuple[str, ...]] = {
+    "amount": ("quantity",),
+    "article": ("id", "ids"),
+    "boxes": ("items",),
+    "count": ("quantity",),
+    "depth": ("d",),
+    "episode": ("sequence",),
+    "group": ("sequence",),
+    "height": ("h",),
+    "length": ("w", "d"),
+    "mass": ("weight", "weights"),
+    "name": ("id", "ids"),
+    "order": ("sequence",),
+    "order_id": ("sequence",),
+    "qty": ("quantity",),
+    "side_up": ("upright",),
+    "sku": ("id", "ids"),
+    "this_side_up": ("upright",),
+    "width": ("w", "d"),
+}
+"""Names that are used for the same things elsewhere, and the valid names they stand for."""
+
+
+def check_names(
+    names: Iterable[str], valid: Sequence[str], required: Sequence[str], source: str, what: str
+) -> None:
+    """Refuse names that are unknown or missing.
+
+    Args:
+        names: the names that are used.
+        valid: the names that may be used.
+        required: those of them that must be.
+        source: the file or argument, for the message.
+        what: a column, key, array or attribute.
+
+    Raises:
+        ValueError: naming what is missing or unknown, the nearest valid name and all of them.
+    """
+    used = list(names)
+    missing = [name for name in required if name not in used]
+    unknown = [name for name in used if name not in valid]
+    problems = []
+    if missing:
+        problems.append(f"no {what} {', '.join(map(repr, missing))}")
+    if unknown:
+        nearest = _nearest(unknown[0], [name for name in valid if name not in used])
+        hint = f"; did you mean {nearest!r}?" if nearest else ""
+        problems.append(f"unknown {what} {unknown[0]!r}{hint}")
+    if problems:
+        text = "; ".join(problems)
+        end = "" if text.endswith("?") else "."
+        raise ValueError(f"{source}: {text}{end} {what.capitalize()}s: {', '.join(valid)}")
+
+
+def _nearest(name: str, free: Sequence[str]) -> str | None:
+    """Return the name of ``free`` that ``name`` most probably means, or None."""
+    plain = "_".join(name.lower().replace("-", " ").split())
+    same = [other for other in (plain, *SYNONYMS.get(plain, ())) if other in free]
+    return next(iter(same + difflib.get_close_matches(plain, free, n=1)), None)

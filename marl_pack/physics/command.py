@@ -1,0 +1,351 @@
+"""Judge stacks in physics: ``python -m marl_pack.sapien_check COMMAND``.
+
+- ``table1``: the paper's Table 1, objects placed at random under a stability rule;
+- ``controls``: stacks whose fate is known, and the margins at which the verdict flips;
+- ``stack FILE``: packings saved by ``python -m marl_pack.evaluate --save-stacks``; also pictures
+  and films.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from marl_pack.files import check_writable, write_json
+from marl_pack.physics import controls, table1
+from marl_pack.physics.options import add_body_options, chosen_bodies
+from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.sapien_check.judge import Judged, Verdict, judge_all
+from marl_pack.sapien_check.stack import Stack
+from marl_pack.sapien_check.world import DEFAULT, Physics, SimulationError
+from marl_pack.stability import RULES
+
+
+def _progress(console: Console) -> Progress:
+    """Return a bar that is gone when the work is done."""
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+
+
+# --- table1 ---------------------------------------------------------------------------------------
+
+
+def run_table1(options: argparse.Namespace, console: Console) -> None:
+    """Play, judge and print Table 1."""
+    if options.objects < 1:
+        raise ValueError(f"--objects {options.objects}: needs 1 or more")
+    rows: dict[str, dict[str, Any]] = {}
+    rules = list(dict.fromkeys(options.rules))
+    if options.save_falls is not None:
+        for rule in rules:
+            check_writable(falls_file(options.save_falls, rule))
+    with _progress(console) as bar:
+        for rule in rules:
+            settings = table1.Settings(rule, options.seed, options.physics)
+            task = bar.add_task(f"{rule}: objects", total=options.objects)
+            trials = table1.run(
+                settings, options.objects, options.processes,
+                lambda done, task=task: bar.advance(task, done),  # type: ignore[misc]  # a default argument binds the task
+            )  # fmt: skip
+            rows[rule] = table1.summary(trials)
+            if options.save_falls and rows[rule]["falls"]:
+                path = falls_file(options.save_falls, rule)
+                save_plans(path, table1.fallen(trials))
+                console.print(f"{path}: the bins in which something fell", soft_wrap=True)
+    show_table1(rows, console, f"Table 1, {options.objects:,} objects a rule, seed {options.seed}")
+    report = {"objects": options.objects, "seed": options.seed, "physics": asdict(options.physics)}
+    if options.json is not None:
+        write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
+
+
+def falls_file(path: Path, rule: str) -> Path:
+    """Return the path of the bins in which something fell under one rule."""
+    return path.with_name(f"{path.name.removesuffix('.npz')}_{rule}.npz")
+
+
+def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -> None:
+    """Print a row for each rule, and the paper's own."""
+    table = Table(title=title, box=box.SIMPLE, padding=0)
+    table.add_column("rule", no_wrap=True)
+    for column in ("objects", "falls", "unst.", "stood", "masks s", "s each", "judge"):
+        table.add_column(column, justify="right", no_wrap=True)
+
+    def falls(r: dict[str, Any]) -> str:
+        return f"{r['falls']} ({100 * r['rate']:.2f} %)"
+
+    for rule, r in rows.items():
+        table.add_row(
+            rule, str(r["objects"]), falls(r), str(r["falls_unstable"]),
+            str(r["unstable_standing"]), f"{r['mask_total']:.1f}", f"{r['mask_each']:.5f}",
+            f"{r['judge_each']:.3f}",
+        )  # fmt: skip
+    for rule in rows:
+        if rule in table1.PAPER:
+            r = table1.PAPER[rule]
+            table.add_row(
+                f"{rule}, paper", str(r["objects"]), falls(r), "", "", str(r["total"]), r["each"]
+            )
+    console.print(table)
+    console.print(
+        "unst.: falls whose stack the exact equilibrium calls unstable; stood: stacks\n"
+        "that it calls unstable and that did not fall; masks s, s each: seconds of all\n"
+        "masks and of one; judge: seconds of a verdict (CPU time; the paper's own words)"
+    )
+
+
+# --- controls -------------------------------------------------------------------------------------
+
+
+def run_controls(options: argparse.Namespace, console: Console) -> bool:
+    """Judge the controls, print them, and return whether all were judged right."""
+    cases = controls.cases()
+    with _progress(console) as bar:
+        task = bar.add_task("controls", total=len(cases))
+        outcomes = []
+        for name, margin, plan in cases:
+            outcomes.append(controls.outcome(name, margin, plan, options.physics))
+            bar.advance(task)
+        task = bar.add_task("margins", total=len(controls.FAMILIES))
+        flips = {}
+        for name, make in controls.FAMILIES.items():
+            flips[name] = controls.flips_at(make, options.physics)
+            bar.advance(task)
+    right = {of: sum(getattr(o, of) == o.known for o in outcomes)
+             for of in ("judge", "equilibrium", "everything")}  # fmt: skip
+    show_controls(outcomes, flips, right, console)
+    report = {
+        "controls": [asdict(o) for o in outcomes],
+        "flips_at_mm": {name: None if math.isnan(at) else at for name, at in flips.items()},
+        "physics": asdict(options.physics),
+    }
+    if options.json is not None:
+        write_json(options.json, report)
+    return right["judge"] == len(outcomes)
+
+
+def show_controls(
+    outcomes: list[controls.Outcome],
+    flips: dict[str, float],
+    right: dict[str, int],
+    console: Console,
+) -> None:
+    """Print a row for each stack, with its verdicts at all margins.
+
+    Args:
+        outcomes: of all controls.
+        flips: name of a family -> margin in millimetres at which the verdict flips.
+        right: field of an outcome -> how many are as known.
+        console: where to print.
+    """
+    table = Table(title="controls: + stands, - falls", box=box.SIMPLE, pad_edge=False)
+    table.add_column("stack", no_wrap=True)
+    for column in ("known", "judge", "exact", "all meet", "flips, mm"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name in dict.fromkeys(o.name for o in outcomes):
+        own = [o for o in outcomes if o.name == name]
+        signs = [
+            "".join("+" if getattr(o, of) else "-" for o in own)
+            for of in ("known", "judge", "equilibrium", "everything")
+        ]
+        at = flips.get(name)
+        flip = "" if at is None else "beyond 8" if math.isnan(at) else f"{at:+.3f}"
+        table.add_row(name, *signs, flip)
+    console.print(table)
+    margins = ", ".join(f"{m:+g}" for m in controls.MARGINS)
+    console.print(
+        f"{len(outcomes)} controls, the decisive centre {margins} mm inside its support;\n"
+        f"judged right: {right['judge']}; by the exact equilibrium {right['equilibrium']}; "
+        f"where all boxes and walls meet {right['everything']}\n"
+        "flips: how far inside it is where the judge's verdict changes"
+    )
+
+
+# --- stack ----------------------------------------------------------------------------------------
+
+
+def run_stack(options: argparse.Namespace, console: Console) -> None:
+    """Judge saved packings, print and write the verdicts, and draw one of the packings."""
+    plans = load_plans(options.file)
+    bodies = chosen_bodies(options)
+    every = range(len(plans))
+    chosen = every if options.episodes is None else list(dict.fromkeys(options.episodes))
+    for e in chosen:
+        if e not in every:
+            raise ValueError(f"--episodes {e}: the file has {len(every)}, counted from 0")
+    if options.render is not None:
+        if len(chosen) != 1:
+            raise ValueError("--render shows one stack: name it by --episodes K")
+        title = f"{options.file.stem}, episode {chosen[0]}"
+        draw(bodies.stack(plans[chosen[0]], chosen[0]), title, options, console)
+    judged: dict[int, Judged] = {}
+    with _progress(console) as bar:
+        task = bar.add_task("episodes", total=len(chosen))
+        stacks = bodies.stacks(plans, chosen)
+        verdicts = judge_all(stacks, options.physics, options.processes)
+        for e, verdict in zip(chosen, verdicts, strict=True):
+            judged[e] = verdict
+            bar.advance(task)
+    show_judged(judged, console)
+    report = {
+        "file": str(options.file), "packings": len(judged),
+        "placements": sum(j.placements for j in judged.values()),
+        "bodies": asdict(bodies), "physics": asdict(options.physics),
+        "falls": [
+            {"episode": e, "boxes": len(j.fall.distance), "moved": j.fall.moved,
+             "metres": j.fall.distance.tolist(), "degrees": j.fall.angle.tolist()}
+            for e, j in judged.items() if j.fall is not None
+        ],
+        "errors": {e: j.error for e, j in judged.items() if j.error is not None},
+    }  # fmt: skip
+    if options.json is not None:
+        write_json(options.json, report)
+
+
+def show_judged(judged: dict[int, Judged], console: Console) -> None:
+    """Print the first falls and errors, and how many there are.
+
+    Args:
+        judged: number of an episode -> its result.
+        console: where to print.
+    """
+    falls = {e: j.fall for e, j in judged.items() if j.fall is not None}
+    for e, fall in list(falls.items())[:20]:
+        console.print(f"episode {e}: {in_words(fall)}", soft_wrap=True)
+    if len(falls) > 20:
+        console.print(f"… and {len(falls) - 20} more (--json keeps all)")
+    errors = {e: j.error for e, j in judged.items() if j.error is not None}
+    for e, error in list(errors.items())[:20]:
+        console.print(f"episode {e}: no verdict: {error}", soft_wrap=True)
+    placements = sum(j.placements for j in judged.values())
+    seconds = sum(j.seconds for j in judged.values())
+    console.print(
+        f"{len(judged):,} packings, {placements:,} placements judged, {len(falls)} fell, "
+        f"{len(errors)} without a verdict; "
+        f"{seconds / max(placements, 1):.3f} s a placement",
+        soft_wrap=True,
+    )
+
+
+def in_words(fall: Verdict) -> str:
+    """Return a fall in words: the box placed last, and the box that rotated most."""
+    farthest = max(fall.moved, key=lambda i: fall.angle[i])
+    others = f" and {len(fall.moved) - 1} more" if len(fall.moved) > 1 else ""
+    return (
+        f"placing box {len(fall.distance) - 1} moved box {farthest} by "
+        f"{1000 * fall.distance[farthest]:.1f} mm and {fall.angle[farthest]:.1f}°{others}"
+    )
+
+
+def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console) -> None:
+    """Write the picture or film of one stack."""
+    from marl_pack.physics import film  # needs a renderer, which nothing else does
+
+    frame = film.render(stack, options.render, f"{title}: {len(stack)} boxes", options.physics)
+    state = f"box {', '.join(map(str, frame.moved))} moved" if frame.moved else "nothing moved"
+    console.print(f"{options.render}: all boxes and walls collide; {state}", soft_wrap=True)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command's options."""
+    options = argparse.ArgumentParser(
+        prog="python -m marl_pack.sapien_check",
+        description="Judge stacks in physics (SAPIEN, on the CPU).",
+    )
+    commands = options.add_subparsers(dest="command", required=True)
+    shared = argparse.ArgumentParser(add_help=False)
+    add = shared.add_argument
+    add("--friction", type=float, default=DEFAULT.friction,
+        help=f"between all faces (default: {DEFAULT.friction})")  # fmt: skip
+    add("--everything", action="store_true",
+        help="let all boxes and the walls collide, as in a real bin: neighbours then prop up what "
+             "would fall")  # fmt: skip
+    add("--json", type=Path, metavar="FILE", help="write the figures there")
+    several = argparse.ArgumentParser(add_help=False)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    hint = f"that work at once (default: 1; here are {cores} cores)"
+    several.add_argument("--processes", type=int, default=1, help=hint)
+
+    first = commands.add_parser(
+        "table1", parents=[shared, several], help="the paper's Table 1", description=table1.__doc__
+    )
+    add = first.add_argument
+    add("--rules", nargs="+", choices=list(RULES), default=["hull_1", "hull_alpha"],
+        help="stability rules (default: the paper's two)")  # fmt: skip
+    add("--objects", type=int, default=3000, help="placed under each rule (default: 3000)")
+    add("--seed", type=int, default=0, help="of objects and cells (default: 0)")
+    add("--save-falls", type=Path, metavar="FILE",
+        help="keep the bins in which something fell, as FILE_RULE.npz, for the command "
+             "stack")  # fmt: skip
+
+    commands.add_parser(
+        "controls", parents=[shared], help="stacks whose fate is known",
+        description=controls.__doc__,
+    )  # fmt: skip
+
+    stack = commands.add_parser(
+        "stack", parents=[shared, several], help="packings saved by evaluate --save-stacks",
+        description="Judge saved packings after each of their placements.",
+    )  # fmt: skip
+    add = stack.add_argument
+    add("file", type=Path, help="from python -m marl_pack.evaluate --save-stacks")
+    add("--episodes", nargs="+", type=int, metavar="K", help="which of them (default: all)")
+    add_body_options(stack)
+    add("--seed", type=int, default=0, help="of drawn bodies (default: 0)")
+    add("--render", type=Path, metavar="FILE",
+        help="show the stack being built: a film (.mp4, .gif) or its end (.png)")  # fmt: skip
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command ``python -m marl_pack.sapien_check``; return its exit status."""
+    options = parser().parse_args(arguments)
+    console = Console()
+    try:
+        if getattr(options, "processes", 1) < 1:
+            raise ValueError(f"--processes {options.processes}: needs 1 or more")
+        if getattr(options, "seed", 0) < 0:
+            raise ValueError(f"--seed {options.seed}: needs 0 or more")
+        if options.json is not None:
+            check_writable(options.json)
+        options.physics = replace(
+            Physics(), friction=options.friction, everything=options.everything
+        )
+        if options.command == "table1":
+            run_table1(options, console)
+        elif options.command == "controls":
+            return 0 if run_controls(options, console) else 1
+        else:
+            run_stack(options, console)
+    except SimulationError as error:
+        print(f"python -m marl_pack.sapien_check: no verdict: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("python -m marl_pack.sapien_check: interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
+        return 2
+    return 0

@@ -1,0 +1,209 @@
+"""Stacks whose fate is known by statics, to test the judge with.
+
+Each family has a margin in millimetres: how far the decisive centre of mass lies inside its support
+(positive: the stack stands; negative: it falls). Beside the judge stands the exact equilibrium.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from marl_pack.plan import Plan
+from marl_pack.sapien_check.judge import check
+from marl_pack.sapien_check.stack import DENSITY, Stack
+from marl_pack.sapien_check.world import DEFAULT, Physics
+from marl_pack.stability import in_equilibrium
+
+MARGINS = (1.0, 0.2, -0.2, -1.0)
+"""Millimetres inside the support at which every family is judged."""
+
+SCALE = 1000
+"""Cells in a millimetre for the exact equilibrium, which takes whole cells."""
+
+WIDEST = 8.0  # millimetres; the verdict is expected to flip within
+BIN = (1000.0, 1000.0, 2000.0)  # millimetres, so that no wall is near
+
+
+def exact_equilibrium(plan: Plan) -> bool:
+    """Return whether a plan in millimetres is in strict static equilibrium, to 1/1000 mm."""
+    boxes = np.rint(plan.boxes * SCALE).astype(np.int64)
+    weights = plan.weights / plan.weights.mean()
+    return in_equilibrium(boxes, np.column_stack((weights, plan.centres * SCALE)))
+
+
+def _plan(
+    *rows: tuple[float, ...],
+    mass: tuple[float, ...] | None = None,
+    last_centre: tuple[float, float] = (0.0, 0.0),
+) -> Plan:
+    """Return boxes in millimetres and kilograms, moved into the middle of the bin.
+
+    Args:
+        rows: x, y, z, w, d, h of each box.
+        mass: kilograms of each box; by default those of filled cartons.
+        last_centre: x, y of the last box's centre of mass from its middle; the others' are there.
+    """
+    boxes = np.array(rows, np.float64)
+    boxes[:, :2] += 300.0 - boxes[:, :2].min(0)
+    weights = boxes[:, 3:].prod(1) * 1e-9 * DENSITY if mass is None else np.array(mass, float)
+    centres = boxes[:, :2] + boxes[:, 3:5] / 2
+    centres[-1] += last_centre
+    return Plan.of_boxes(BIN, boxes, np.column_stack((weights, centres)), unit_mm=1.0)
+
+
+def cube(edge: float, margin: float) -> Plan:
+    """Return a cube half over another's edge."""
+    return _plan((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
+
+
+def heavy_on_light(ratio: float, margin: float) -> Plan:
+    """Return the paper's figure: a light box hangs over, and a heavier one stands on its end.
+
+    The decisive centre is that of both together.
+    """
+    middle = ((200 - margin) * (1 + ratio) - 150) / ratio
+    return _plan(
+        (0, 0, 0, 200, 200, 100), (0, 0, 100, 300, 200, 50), (middle - 50, 50, 150, 100, 100, 100),
+        mass=(1, 1, ratio),
+    )  # fmt: skip
+
+
+def harmonic(count: int, margin: float) -> Plan:
+    """Return planks, each as far out as those above allow less 5 mm; the lowest decides."""
+    length, rows, centre = 300.0, [(0.0, 0.0, 50.0 * (count - 1), 300.0, 100.0, 50.0)], 150.0
+    for above in range(1, count):
+        slack = margin if above == count - 1 else 5.0
+        x = centre + slack - length  # its edge lies so far beyond the centre of all above
+        rows.append((x, 0.0, 50.0 * (count - 1 - above), length, 100.0, 50.0))
+        centre = (centre * above + x + length / 2) / (above + 1)
+    return _plan(*rows[::-1])
+
+
+def counterweight(margin: float) -> Plan:
+    """Return a plank with its middle beyond the post and a weight on its other end."""
+    weight = (100 + margin) / (75 - margin)
+    return _plan(
+        (0, 0, 0, 100, 100, 100), (0, 0, 100, 400, 100, 20), (0, 25, 120, 50, 50, 50),
+        mass=(1, 1, weight),
+    )  # fmt: skip
+
+
+def diagonal(margin: float) -> Plan:
+    """Return a plate on posts under opposite corners, its centre of mass off the diagonal."""
+    off = 30 - margin / math.sqrt(2)
+    return _plan(
+        (0, 0, 0, 60, 60, 100), (240, 240, 0, 60, 60, 100), (0, 0, 100, 300, 300, 100),
+        last_centre=(off, -off),
+    )  # fmt: skip
+
+
+def bridge(margin: float) -> Plan:
+    """Return a plate over a gap, its centre of mass near the line from post to post."""
+    return _plan(
+        (0, 0, 0, 80, 60, 150), (200, 0, 0, 100, 60, 150), (0, 0, 150, 300, 100, 40),
+        last_centre=(0, 10 - margin),
+    )  # fmt: skip
+
+
+def propped(gap: float, edge: float, margin: float) -> Plan:
+    """Return a cube half over another's edge, with a tall neighbour where it would fall."""
+    high = cube(edge, margin).boxes - [300, 300, 0, 0, 0, 0]
+    side = high[1, 0] + edge + gap
+    return _plan(*map(tuple, high), (side, 0, 0, edge, edge, 3 * edge))
+
+
+FAMILIES: dict[str, Callable[[float], Plan]] = {
+    **{f"cube of {edge} mm over an edge": partial(cube, edge) for edge in (30, 60, 100, 200, 300)},
+    **{f"box {r} times heavier on a light one": partial(heavy_on_light, r) for r in (1, 10, 100)},
+    "box 1000 times heavier on a light one": partial(heavy_on_light, 1000),
+    **{f"harmonic overhang, {n} planks": partial(harmonic, n) for n in (3, 5, 8)},
+    "plank held by a counterweight": counterweight,
+    "plate on diagonal posts": diagonal,
+    "plate over a gap": bridge,
+    "cube beside a tall neighbour, 0 mm": partial(propped, 0.0, 100.0),
+    "cube beside a tall neighbour, 1 mm": partial(propped, 1.0, 100.0),
+}
+"""Name of each family, and its plan for a margin in millimetres."""
+
+
+def tower(count: int, edge: float) -> Plan:
+    """Return cubes one on the other."""
+    return _plan(*((0, 0, edge * k, edge, edge, edge) for k in range(count)))
+
+
+def wall_of_bricks() -> Plan:
+    """Return six courses of bricks, each over the joints of the one below."""
+    rows = []
+    for course in range(6):
+        ends = [0, 50, 150, 250, 300] if course % 2 else [0, 100, 200, 300]
+        for a, b in pairwise(ends):
+            rows.append((a, 0, 40 * course, b - a, 60, 40))
+    return _plan(*rows)
+
+
+STANDING: dict[str, Callable[[], Plan]] = {
+    "tower of 20 cubes of 30 mm": partial(tower, 20, 30.0),
+    "tower of 6 cubes of 100 mm": partial(tower, 6, 100.0),
+    "wall of bricks": wall_of_bricks,
+}
+"""Stacks that stand with room to spare."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Verdicts on one control, each true if it stands."""
+
+    name: str
+    margin: float | None  # mm; None: stands with room to spare
+    known: bool  # by statics
+    judge: bool
+    equilibrium: bool
+    everything: bool  # the judge's, with all boxes and the walls colliding
+
+
+def outcome(name: str, margin: float | None, plan: Plan, physics: Physics = DEFAULT) -> Outcome:
+    """Judge one control by physics and by the exact equilibrium."""
+    stack = Stack.of_plan(plan)
+    return Outcome(
+        name,
+        margin,
+        margin is None or margin > 0,
+        check(stack, physics).stands,
+        exact_equilibrium(plan),
+        check(stack, replace(physics, everything=True)).stands,
+    )
+
+
+def cases() -> list[tuple[str, float | None, Plan]]:
+    """Return the name, margin and plan of every control."""
+    tipping: list[tuple[str, float | None, Plan]] = [
+        (name, margin, make(margin)) for name, make in FAMILIES.items() for margin in MARGINS
+    ]
+    return tipping + [(name, None, build()) for name, build in STANDING.items()]
+
+
+def flips_at(make: Callable[[float], Plan], physics: Physics = DEFAULT) -> float:
+    """Return the margin in mm at which the judge's verdict flips, to 1 µm; 0 would be right.
+
+    NaN if it does not flip within 8 mm.
+    """
+
+    def stands(margin: float) -> bool:
+        return check(Stack.of_plan(make(margin)), physics).stands
+
+    low, high = -WIDEST, WIDEST
+    if stands(low) or not stands(high):
+        return math.nan
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        if stands(middle):
+            high = middle
+        else:
+            low = middle
+    return (low + high) / 2

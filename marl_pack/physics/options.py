@@ -1,0 +1,34 @@
+"""Options of the commands that judge packings: what the boxes really are."""
+
+from __future__ import annotations
+
+import argparse
+
+from marl_pack.sapien_check.bodies import Bodies
+
+BODY_OPTIONS = ("cell", "density", "com_spread")
+"""Names of the options that :func:`add_body_options` adds; each is None unless it is given."""
+
+
+def add_body_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--cell``, ``--density`` and ``--com-spread`` to a command."""
+    add = parser.add_argument
+    add("--cell", type=float, metavar="METRES",
+        help="edge of a cell (default: the plan's own unit, else the bin's longest side is "
+             "0.6 m)")  # fmt: skip
+    add("--density", nargs=2, type=float, metavar=("LOW", "HIGH"),
+        help="density of each box, drawn between these, in kg/m³ "
+             "(default: as packed)")  # fmt: skip
+    add("--com-spread", type=float, metavar="SHARE",
+        help="centre of mass of each box, drawn up to this share of each side off "
+             "(default: 0)")  # fmt: skip
+
+
+def chosen_bodies(options: argparse.Namespace) -> Bodies:
+    """Return the bodies that ``--cell``, ``--density``, ``--com-spread`` and ``--seed`` choose.
+
+    Raises:
+        ValueError: for a value that cannot be.
+    """
+    density = None if options.density is None else (options.density[0], options.density[1])
+    return Bodies(options.cell, density, options.com_spread or 0.0, options.seed)

@@ -1,0 +1,347 @@
+"""Plans: boxes as they were placed, in order, in one bin or several.
+
+A plan is what a game, a benchmark or a robot hands on once boxes have been placed. It does not
+change. It reads and writes JSON and CSV, which are meant for other programs; archives of many plans
+are in :mod:`marl_pack.plan_archive`. Shapes use the letters B (bins) and n (boxes).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_pack.bins import ORIENTATIONS, Bins
+from marl_pack.files import write_atomically, write_json
+
+Array = NDArray[Any]
+
+SLACK = 1e-9
+"""Share of a bin's longest side by which rounding may move a face or a centre outside."""
+
+UNIT = "unit_mm"  # key of the unit in JSON, CSV and .npz
+BOX = (
+    "id", "bin", "x", "y", "z", "w", "d", "h", "orientation", "weight", "centre_x", "centre_y"
+)  # fmt: skip
+"""Keys of a box in JSON, and the first columns of a CSV file."""
+COLUMNS = (*BOX, "bin_w", "bin_d", "bin_h", UNIT)
+"""Columns of a CSV file: every row repeats the size of its bin and the unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """n boxes in order of placement, in B bins.
+
+    Lengths are in units of ``unit_mm`` millimetres. They are int64 if all lengths are whole
+    numbers given as integers, else float64. Arrays are read-only copies of the arguments.
+
+    Raises:
+        ValueError: for a shape or value that cannot be, naming the field and the box.
+    """
+
+    bin_sizes: Array  # [B, 3]        sides W, D, H of each bin
+    bins: NDArray[np.int64]  # [n]    bin of each box
+    positions: Array  # [n, 3]        low corner x, y, z in its bin
+    sides: Array  # [n, 3]            along x, y, z, as placed
+    orientations: NDArray[np.int64]  # [n]   row of marl_pack.bins.ORIENTATIONS; -1: unknown
+    weights: NDArray[np.float64]  # [n]      > 0, in any unit (kilograms where it matters)
+    centres: NDArray[np.float64]  # [n, 2]   x, y of the centre of mass in its bin
+    ids: tuple[str, ...]  # [n]       "" where unknown
+    unit_mm: float | None = None  # millimetres of one unit; None: abstract cells
+
+    def __post_init__(self) -> None:
+        n, b = len(self.positions), len(self.bin_sizes)
+        shapes = {
+            "bin_sizes": (b, 3), "positions": (n, 3), "sides": (n, 3), "bins": (n,),
+            "orientations": (n,), "weights": (n,), "centres": (n, 2),
+        }  # fmt: skip
+        arrays = {key: _numbers(key, getattr(self, key), shape) for key, shape in shapes.items()}
+        lengths = ("bin_sizes", "positions", "sides")
+        whole = all(arrays[key].dtype.kind in "iu" or not arrays[key].size for key in lengths)
+        kinds = dict.fromkeys(lengths, np.int64 if whole else np.float64)
+        kinds |= {"bins": np.int64, "orientations": np.int64}
+        for key, array in arrays.items():
+            if kinds.get(key) is np.int64 and array.dtype.kind == "f" and array.size:
+                raise ValueError(f"{key}: needs whole numbers")
+            array = array.astype(kinds.get(key, np.float64))
+            array.flags.writeable = False
+            object.__setattr__(self, key, array)
+        object.__setattr__(self, "ids", tuple(self.ids))
+        if len(self.ids) != n or not all(isinstance(name, str) for name in self.ids):
+            raise ValueError(f"ids: needs one text for each of {n} boxes")
+        self._check_values()
+
+    def _check_values(self) -> None:
+        """Refuse values that cannot be, naming the first box for which one is wrong."""
+        unit = self.unit_mm
+        if unit is not None and not (np.isfinite(unit) and unit > 0):
+            raise ValueError(f"unit_mm = {unit}: needs a positive length in millimetres")
+        if not len(self.bin_sizes) or not (self.bin_sizes > 0).all():
+            raise ValueError(f"bin_sizes {self.bin_sizes.tolist()}: needs positive sides W, D, H")
+        last = len(self.bin_sizes) - 1
+        self._refuse((self.bins < 0) | (self.bins > last), f"needs a bin from 0 to {last}")
+        self._refuse((self.sides <= 0).any(1), "needs sides longer than 0")
+        size = self.bin_sizes[self.bins]
+        slack = SLACK * size.max(1, initial=0)[:, None]
+        high = self.positions + self.sides
+        outside = (self.positions < -slack) | (high > size + slack)
+        self._refuse(outside.any(1), "reaches out of its bin")
+        wrong = (self.orientations < -1) | (self.orientations >= len(ORIENTATIONS))
+        self._refuse(wrong, f"needs an orientation from 0 to {len(ORIENTATIONS) - 1}, or -1")
+        self._refuse(self.weights <= 0, "needs a positive weight")
+        off = (self.centres < self.positions[:, :2] - slack) | (self.centres > high[:, :2] + slack)
+        self._refuse(off.any(1), "needs a centre of mass inside the box")
+
+    def _refuse(self, wrong: Any, why: str) -> None:
+        """Raise ValueError with the first box for which ``wrong`` [n] is true."""
+        if wrong.any():
+            i = int(wrong.argmax())
+            row = ", ".join(f"{value:g}" for value in self.boxes[i])
+            raise ValueError(f"box {i} ({row}): {why}")
+
+    @classmethod
+    def of_boxes(
+        cls,
+        bin_size: Sequence[float],
+        boxes: ArrayLike,
+        loads: ArrayLike | None = None,
+        *,
+        orientations: ArrayLike | None = None,
+        ids: Sequence[str] | None = None,
+        unit_mm: float | None = None,
+    ) -> Plan:
+        """Return the plan of boxes in one bin.
+
+        Args:
+            bin_size: the bin's W, D, H.
+            boxes: [n, 6], rows x, y, z, w, d, h in order of placement.
+            loads: [n, 3], weight and x, y of each centre of mass; by default the volume and the
+                middle of the box.
+            orientations: int [n]; unknown by default.
+            ids: n texts; unknown by default.
+            unit_mm: millimetres of one unit of length; None for abstract cells.
+
+        Raises:
+            ValueError: as the constructor.
+        """
+        boxes = np.asarray(boxes)
+        boxes = boxes if boxes.size else boxes.reshape(0, 6)
+        if boxes.ndim != 2 or boxes.shape[1] != 6:
+            raise ValueError(f"boxes: shape {boxes.shape}, needs [n, 6]: x, y, z, w, d, h")
+        n, low, sides = len(boxes), boxes[:, :3], boxes[:, 3:]
+        if loads is None:
+            volumes = sides.astype(np.float64).prod(1)
+            loads = np.column_stack((volumes, low[:, :2] + sides[:, :2] / 2))
+        loads = np.asarray(loads, np.float64).reshape(-1, 3)
+        return cls(
+            bin_sizes=np.asarray(bin_size)[None],
+            bins=np.zeros(n, np.int64),
+            positions=low,
+            sides=sides,
+            orientations=np.full(n, -1) if orientations is None else np.asarray(orientations),
+            weights=loads[:, 0],
+            centres=loads[:, 1:],
+            ids=("",) * n if ids is None else tuple(ids),
+            unit_mm=unit_mm,
+        )
+
+    @classmethod
+    def from_bins(
+        cls,
+        bins: Bins,
+        game: int,
+        *,
+        id_names: Sequence[str] | None = None,
+        unit_mm: float | None = None,
+    ) -> Plan:
+        """Return the plan of one bin of a game's state.
+
+        Args:
+            bins: the state, on the CPU.
+            game: index of the bin.
+            id_names: text of each number that the state keeps as an item's id; by default the
+                number itself.
+            unit_mm: millimetres of a cell, if known.
+        """
+        n = int(bins.count[game])
+        labels = getattr(bins, "labels", None)
+        numbers, orientations = [-1] * n, None
+        if labels is not None:
+            numbers, orientations = labels[game, :n, 0].tolist(), labels[game, :n, 1].numpy()
+        name: Callable[[int], str] = str if id_names is None else id_names.__getitem__
+        return cls.of_boxes(
+            bins.size, bins.boxes[game, :n].numpy(), bins.loads[game, :n].numpy(),
+            orientations=orientations, unit_mm=unit_mm,
+            ids=["" if number < 0 else name(number) for number in numbers],
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Plan):
+            return NotImplemented
+        mine, theirs = ([getattr(plan, f.name) for f in fields(Plan)] for plan in (self, other))
+        return all(map(np.array_equal, mine[:-2], theirs[:-2])) and mine[-2:] == theirs[-2:]
+
+    __hash__ = None  # type: ignore[assignment]  # arrays have none
+
+    @property
+    def boxes(self) -> Array:
+        """Rows x, y, z, w, d, h of the boxes, [n, 6]."""
+        return np.hstack((self.positions, self.sides))
+
+    @property
+    def loads(self) -> NDArray[np.float64]:
+        """Weight and x, y of the centre of mass of the boxes, [n, 3]."""
+        return np.column_stack((self.weights, self.centres))
+
+    @property
+    def utilization(self) -> float:
+        """Share of the volume of all bins that the boxes fill."""
+        return float(self.sides.prod(1).sum() / self.bin_sizes.prod(1).sum())
+
+    def first(self, count: int) -> Plan:
+        """Return the plan as it was when ``count`` boxes had been placed."""
+        return self._select(np.arange(len(self)) < count, self.bins, self.bin_sizes)
+
+    def in_bin(self, index: int) -> Plan:
+        """Return the boxes of one bin as a plan of that bin alone."""
+        sizes = self.bin_sizes[index : index + 1]
+        return self._select(self.bins == index, np.zeros_like(self.bins), sizes)
+
+    def _select(self, which: NDArray[np.bool_], bins: Array, bin_sizes: Array) -> Plan:
+        """Return the chosen boxes, bool [n], with other bins."""
+        return Plan(
+            bin_sizes, bins[which], self.positions[which], self.sides[which],
+            self.orientations[which], self.weights[which], self.centres[which],
+            tuple(name for name, chosen in zip(self.ids, which, strict=True) if chosen),
+            self.unit_mm,
+        )  # fmt: skip
+
+    # --- files of one plan ------------------------------------------------------------------------
+
+    def _rows(self) -> list[list[Any]]:
+        """Return the values of :data:`BOX` for each box, as Python's own types."""
+        columns = (self.bins, self.positions, self.sides, self.orientations, self.weights,
+                   self.centres)  # fmt: skip
+        parts = [np.atleast_2d(array.T).T.tolist() for array in columns]
+        return [[name, *chain(*row)] for name, *row in zip(self.ids, *parts, strict=True)]
+
+    @classmethod
+    def _of_rows(cls, bin_sizes: Any, rows: Sequence[Sequence[Any]], unit_mm: Any) -> Plan:
+        """Return the plan of rows as :meth:`_rows` returns them."""
+        table = dict(zip(BOX, zip(*rows, strict=True), strict=True)) if rows else {}
+
+        def columns(*names: str) -> Array:
+            return np.array([table.get(name, ()) for name in names]).T
+
+        return cls(
+            np.asarray(bin_sizes), columns("bin").ravel(), columns("x", "y", "z"),
+            columns("w", "d", "h"), columns("orientation").ravel(), columns("weight").ravel(),
+            columns("centre_x", "centre_y"), table.get("id", ()), unit_mm,
+        )  # fmt: skip
+
+    def to_json(self, path: Path) -> None:
+        """Write the plan as JSON: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
+
+        Each box is an object with the keys :data:`BOX`.
+        """
+        boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
+        write_json(path, {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes})
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Plan:
+        """Read a plan that :meth:`to_json` wrote.
+
+        Raises:
+            ValueError: if it is another kind of file, or for a value that cannot be.
+        """
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            rows = [[box[key] for key in BOX] for box in content["boxes"]]
+            return cls._of_rows(content["bins"], rows, content[UNIT])
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not a plan in JSON ({error!r})") from None
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def to_csv(self, path: Path) -> None:
+        """Write the plan as CSV: a header line, then one line for each box, in order.
+
+        The columns are :data:`COLUMNS`. Each line says the size of its bin and the unit
+        (``unit_mm``, empty for abstract cells), so that a reader needs nothing else.
+
+        Raises:
+            ValueError: if a bin is empty: only JSON can hold it.
+        """
+        empty = sorted(set(range(len(self.bin_sizes))) - set(self.bins.tolist()))
+        if empty:
+            raise ValueError(f"{path}: bin {empty[0]} is empty, which CSV cannot hold; write JSON")
+        unit = "" if self.unit_mm is None else self.unit_mm
+        sizes = self.bin_sizes[self.bins].tolist()
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        rows = zip(self._rows(), sizes, strict=True)
+        writer.writerows([*row, *size, unit] for row, size in rows)
+        write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> Plan:
+        """Read a plan that :meth:`to_csv` wrote.
+
+        Raises:
+            ValueError: if it is another kind of file, or for a value that cannot be.
+        """
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            header, *lines = list(csv.reader(file)) or [[]]
+        if header != list(COLUMNS) or not lines:
+            raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and a line for a box")
+        sizes: dict[int, list[float]] = {}
+        rows, units = [], set()
+        for number, line in enumerate(lines):
+            try:
+                if len(line) != len(COLUMNS):
+                    raise ValueError(f"has {len(line)} values, needs {len(COLUMNS)}")
+                name, *values, unit = line
+                row = [_number(value) for value in values]
+                if sizes.setdefault(int(row[0]), row[-3:]) != row[-3:]:
+                    raise ValueError(f"bin {row[0]} has another size than before")
+                rows.append([name, *row[:-3]])
+                units.add(float(unit) if unit else None)
+            except ValueError as error:
+                raise ValueError(f"{path}: box {number}: {error}") from None
+        if len(units) > 1 or sorted(sizes) != list(range(len(sizes))):
+            raise ValueError(f"{path}: needs one unit, and bins numbered from 0 without a gap")
+        try:
+            return cls._of_rows([sizes[k] for k in sorted(sizes)], rows, units.pop())
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+
+def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """Return numbers as a new array, an empty one in the shape that it needs."""
+    array = np.array(values)
+    array = array if array.size else array.reshape(shape)
+    if array.shape != shape:
+        raise ValueError(f"{name}: shape {array.shape}, needs {shape}")
+    if array.size and (array.dtype.kind not in "iuf" or not np.isfinite(array).all()):
+        raise ValueError(f"{name}: needs finite numbers")
+    return array
+
+
+def _number(text: str) -> float:
+    """Return a number of a CSV file, an int if it is written as one."""
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)

@@ -1,0 +1,238 @@
+"""The SAPIEN scene: a bin with boxes at their nominal poses, gravity, and what collides with what.
+
+SAPIEN is loaded when the first world is built, so that importing this module needs nothing but
+NumPy.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from marl_pack.sapien_check.stack import SLACK, Floats, Stack, overlaps
+
+GROUND_BIT = 31  # of the collision groups: the floor
+WALL = 0.05  # metres, thickness of the walls
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One simulation: time step in seconds, and position iterations of the solver."""
+
+    dt: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Settings of a simulation, and the thresholds of a fall.
+
+    Raises:
+        ValueError: for a number that cannot be.
+    """
+
+    friction: float = 0.5  # static and dynamic, between all faces
+    duration: float = 1.0  # seconds that a stack has to stand
+    patience: float = 3.0  # the same where a box is past a tenth of a threshold by then
+    distance: float = 0.003  # metres that the middle of a box may move, once scaled
+    angle: float = 1.0  # degrees that a box may rotate
+    contact_offset: float = 0.002  # metres from which on contacts are made, once scaled
+    passes: tuple[Pass, ...] = (Pass(1 / 240, 50), Pass(1 / 1000, 25), Pass(1 / 4000, 100))
+    heavy: Pass = Pass(1 / 16000, 200)  # one more where some boxes are far heavier than others
+    everything: bool = False  # all boxes and the walls collide
+
+    def __post_init__(self) -> None:
+        numbers = (self.duration, self.patience, self.distance, self.angle, self.contact_offset)
+        if not self.passes or not all(0 < value < np.inf for value in numbers):
+            raise ValueError(f"{self}: needs a pass and positive numbers")
+        if not 0 <= self.friction < np.inf:
+            raise ValueError(f"friction = {self.friction}: needs a number, 0 or more")
+
+
+DEFAULT = Physics()
+
+
+class SimulationError(RuntimeError):
+    """A stack gets no verdict: its simulation diverged, or it is beyond the judge."""
+
+
+@functools.cache
+def load_sapien() -> Any:
+    """Return the package sapien, loaded when it is first needed.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about drivers for rendering, which is not done here
+            import sapien
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{error}: the judge needs SAPIEN (pip install 'marl_pack[physics]')"
+        ) from None
+    return sapien
+
+
+class World:
+    """A bin with boxes at their nominal poses, and gravity.
+
+    SAPIEN keeps solver settings for the whole process and takes them when a system and its bodies
+    are made: a world changes them.
+
+    Args:
+        stack: the boxes.
+        physics: friction, and what collides.
+        step: time step and iterations.
+        groups: of :func:`collision_groups`, if the caller has computed them.
+    """
+
+    def __init__(
+        self, stack: Stack, physics: Physics, step: Pass, groups: list[list[int]] | None = None
+    ) -> None:
+        sapien = self.sapien = load_sapien()
+        physx = sapien.physx
+        physx.set_scene_config(enable_tgs=True, enable_pcm=True, enable_ccd=False)
+        physx.set_body_config(
+            solver_position_iterations=step.iterations, solver_velocity_iterations=1,
+            sleep_threshold=0.0,
+        )  # fmt: skip
+        physx.set_shape_config(contact_offset=physics.contact_offset, rest_offset=0.0)
+        self.system = physx.PhysxCpuSystem()
+        self.system.timestep = step.dt
+        self.scene = sapien.Scene([self.system])
+        self.stack, self.physics = stack, physics
+        self.material = physx.PhysxMaterial(physics.friction, physics.friction, 0.0)
+        self._fix((*stack.size[:2] / 2, -0.5), (*(stack.size[:2] / 2 + 1.0), 0.5))
+        if physics.everything:
+            self._add_walls(stack.size)
+        groups = collision_groups(stack, physics) if groups is None else groups
+        self.bodies = [self._add_box(stack, i, groups[i]) for i in range(len(stack))]
+
+    def _fix(self, middle: Sequence[float], half: Sequence[float]) -> None:
+        """Add a fixed box with which all boxes on the floor collide."""
+        physx = self.sapien.physx
+        body = physx.PhysxRigidStaticComponent()
+        shape = physx.PhysxCollisionShapeBox(np.array(half, np.float32), self.material)
+        shape.set_collision_groups([1 << GROUND_BIT, 1 << GROUND_BIT, 0, 0])
+        body.attach(shape)
+        self._add(body, middle)
+
+    def _add(self, body: Any, middle: Sequence[float]) -> None:
+        """Add a body to the scene with its middle at a point."""
+        entity = self.sapien.Entity()
+        entity.add_component(body)
+        entity.set_pose(self.sapien.Pose(list(middle)))
+        self.scene.add_entity(entity)
+
+    def _add_walls(self, size: Floats) -> None:
+        """Add four walls, as tall as the bin."""
+        for axis in (0, 1):
+            for side in (-WALL / 2, size[axis] + WALL / 2):
+                middle, half = size / 2, size / 2 + WALL
+                middle[axis], half[axis], half[2] = side, WALL / 2, size[2] / 2
+                self._fix(middle.tolist(), half.tolist())
+
+    def _add_box(self, stack: Stack, i: int, groups: list[int]) -> Any:
+        """Add box i of the stack as a moving body, and return the body."""
+        physx = self.sapien.physx
+        body = physx.PhysxRigidDynamicComponent()
+        sides, mass = stack.sides[i], float(stack.mass[i])
+        shape = physx.PhysxCollisionShapeBox((sides / 2).astype(np.float32), self.material)
+        shape.set_collision_groups(groups)
+        body.attach(shape)
+        body.set_mass(mass)
+        body.set_cmass_local_pose(self.sapien.Pose(stack.com[i].tolist()))
+        square = sides**2
+        body.set_inertia((mass / 12 * (square.sum() - square)).astype(np.float32))
+        body.set_linear_damping(0.0)
+        body.set_angular_damping(0.0)
+        self._add(body, stack.middle[i].tolist())
+        return body
+
+    def set_poses(self, middles: Floats, turns: Floats) -> None:
+        """Put the first boxes at poses in the form that :meth:`poses` returns."""
+        for body, middle, turn in zip(self.bodies, middles, turns, strict=False):
+            body.entity.set_pose(self.sapien.Pose(middle.tolist(), turn.tolist()))
+
+    def run(self, seconds: float) -> None:
+        """Simulate so many seconds, to the nearest step."""
+        for _ in range(max(1, round(seconds / self.system.timestep))):
+            self.system.step()
+
+    def poses(self) -> tuple[Floats, Floats]:
+        """Return middles [n, 3] in metres and quaternions [n, 4], w first.
+
+        Raises:
+            SimulationError: if they are no numbers, or boxes have shot away.
+        """
+        poses = [body.entity_pose for body in self.bodies]
+        middles = np.array([pose.p for pose in poses], np.float64).reshape(-1, 3)
+        turns = np.array([pose.q for pose in poses], np.float64).reshape(-1, 4)
+        if not (np.isfinite(middles).all() and np.isfinite(turns).all()):
+            raise SimulationError("the simulation diverged: poses are not finite")
+        if (np.abs(middles) > 1e3).any():
+            raise SimulationError("the simulation diverged: a box is over 1 km away")
+        return middles, turns
+
+    def movement(self) -> tuple[Floats, Floats]:
+        """Return how far each box is from its nominal pose: metres of its middle and degrees, [n].
+
+        Raises:
+            SimulationError: as :meth:`poses`.
+        """
+        middles, turns = self.poses()
+        # The vector part's length is the sine of half the angle: exact for small ones.
+        vector = np.linalg.norm(turns[:, 1:], axis=1)
+        distance = np.linalg.norm(middles - self.stack.middle, axis=1)
+        return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
+
+    def moved(self) -> tuple[int, ...]:
+        """Return the boxes past a threshold."""
+        return past(*self.movement(), self.physics)
+
+
+def past(distance: Floats, angle: Floats, physics: Physics, share: float = 1) -> tuple[int, ...]:
+    """Return the boxes that moved or rotated by more than a share of the thresholds."""
+    far = (distance > share * physics.distance) | (angle > share * physics.angle)
+    return tuple(np.flatnonzero(far).tolist())
+
+
+def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
+    """Return SAPIEN's four collision words for each box.
+
+    Two shapes collide if a bit of one's first word is in the other's second. Each box that carries
+    others has one bit as its first word, and those that rest on it have that bit in their second.
+    There are fewer bits than boxes, so boxes share one where nothing that rests on either could
+    come to touch the other before the verdict falls.
+    """
+    n = len(stack)
+    if physics.everything:
+        every = 1 | 1 << GROUND_BIT
+        return [[every, every, 0, 0]] * n
+    on = stack.rests_on()
+    near = 2 * (physics.distance + physics.contact_offset)  # both may come closer
+    gap = -overlaps(stack.low, stack.high)
+    stray = (gap < near).all(-1) & ~on  # [i, j]: i could come to touch j, but does not rest on it
+    np.fill_diagonal(stray, False)
+    # j and k may not share a bit if something on j could touch k without resting on it.
+    apart = (on.T.astype(np.float32) @ stray.astype(np.float32)) > 0
+    apart |= apart.T
+    bit = np.full(n, -1)
+    for j in np.flatnonzero(on.any(0)):
+        taken = set(bit[apart[j]].tolist())
+        bit[j] = next(b for b in range(n + 1) if b not in taken)
+    if n and bit.max() >= GROUND_BIT:
+        raise SimulationError(f"{n} boxes are too many so close together for the collision groups")
+    first = [1 << int(b) if b >= 0 else 0 for b in bit]
+    second = [0] * n
+    for i, j in np.argwhere(on):
+        second[i] |= first[j]
+    for i in np.flatnonzero(stack.low[:, 2] < SLACK):
+        second[i] |= 1 << GROUND_BIT
+    return [[a, b, 0, 0] for a, b in zip(first, second, strict=True)]

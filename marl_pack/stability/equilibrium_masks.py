@@ -1,0 +1,151 @@
+"""Masks of exact static equilibrium: where a box leaves the whole stack standing.
+
+``hull_alpha`` true is a yes (the new weight goes straight down through solid columns) and
+``hull_1`` false a no (the box itself tips); only the cells between are solved, by the reduced
+linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Where its simplex is unsure, HiGHS
+decides (:mod:`marl_pack.stability.static_equilibrium`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from marl_pack.bins import Bins
+from marl_pack.stability.oriented_item import OrientedItem
+from marl_pack.stability.reduced_equilibrium import (
+    UNSURE,
+    YES,
+    ground_points,
+    mark_bearing,
+    stands,
+    survey,
+)
+from marl_pack.stability.static_equilibrium import in_equilibrium
+
+DIRECTIONS = 16
+"""Corners of the polygon drawn around the disc of radius ``margin`` (2 % on the safe side)."""
+
+
+@njit(cache=True, nogil=True)
+def _solve_band(
+    heightmap: Any, empty_map: Any, boxes: Any, loads: Any, count: Any, sides: Any, com: Any,
+    weight: Any, shifts: Any, whole: Any, band: Any, verdict: Any,
+) -> None:  # fmt: skip
+    """Write YES, NO or UNSURE to ``verdict`` [N, A, W, D] for every cell of ``band``.
+
+    YES: the stack stands with every one of the ``shifts`` [S, 2] of the new box's centre of mass.
+    ``whole`` [N] says where all of the stack is solved, not only the boxes that may be disturbed.
+    """
+    n, width, depth = heightmap.shape
+    scratch = np.empty((3, 2 * width + 2, 2), np.int64)
+    bearing = np.empty((width, depth), np.bool_)
+    for b in range(n):
+        if not band[b].any():
+            continue
+        k = count[b]
+        stack = np.empty((k + 1, 6), np.int64)
+        load = np.empty((k + 1, 3))
+        stack[:k], load[:k] = boxes[b, :k], loads[b, :k]
+        grounded, points, size = survey(stack, k, (width, depth), scratch)
+        for a in range(sides.shape[1]):
+            w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
+            if w < 1 or d < 1 or h < 1:
+                continue
+            for x in range(width - w + 1):
+                for y in range(depth - d + 1):
+                    if not band[b, a, x, y]:
+                        continue
+                    z = heightmap[b, x : x + w, y : y + d].max()
+                    cells = bearing[:w, :d]
+                    mark_bearing(heightmap[b], empty_map[b], x, y, z, cells)
+                    stack[k, 0], stack[k, 1], stack[k, 2] = x, y, z
+                    stack[k, 3], stack[k, 4], stack[k, 5] = w, d, h
+                    size[k] = ground_points(cells, scratch, points[k])
+                    result = YES
+                    load[k, 0] = weight[b]
+                    for s in range(shifts.shape[0]):
+                        load[k, 1] = x + com[b, a, 0] + shifts[s, 0]
+                        load[k, 2] = y + com[b, a, 1] + shifts[s, 1]
+                        if result == YES:
+                            result = stands(stack, load, k, grounded, points, size, whole[b])
+                    verdict[b, a, x, y] = result
+
+
+def equilibrium_mask(
+    bins: Bins,
+    item: OrientedItem,
+    surely: Tensor,
+    possibly: Tensor,
+    margin: float = 0.0,
+    check_stack: bool = False,
+) -> Tensor:
+    """Compute where a box leaves the whole stack in strict equilibrium, bool [N, A, W, D].
+
+    The linear programs are solved on the CPU, whatever device the bins are on.
+
+    Args:
+        bins: with their boxes in order of placement.
+        item: as for every rule.
+        surely: bool [N, A, W, D], the mask of ``hull_alpha``: cells known to be stable.
+        possibly: bool [N, A, W, D], the mask of ``hull_1``: cells that may be stable.
+        margin: the new box's centre of mass may lie anywhere within so many cells of its place.
+        check_stack: whether to check first that the stack is in equilibrium. Where it is not,
+            nothing is assumed and the whole stack is solved for every cell of ``possibly``.
+
+    Returns:
+        ``surely``, and the cells of ``possibly`` where the whole stack stands.
+    """
+    device = bins.device
+    stack = bins.to("cpu")
+    whole = np.zeros(len(bins), np.bool_)
+    if check_stack:
+        for b in range(len(bins)):
+            k = int(stack.count[b])
+            whole[b] = not in_equilibrium(stack.boxes[b, :k].numpy(), stack.loads[b, :k].numpy())
+    sure = surely & ~torch.from_numpy(whole).to(device)[:, None, None, None]
+    band = possibly & ~sure
+    if not bool(band.any()):
+        return sure
+    shifts = np.zeros((1, 2))
+    if margin > 0:
+        angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+        shifts = margin / np.cos(np.pi / DIRECTIONS) * np.stack((np.cos(angle), np.sin(angle)), 1)
+    verdict = np.zeros(tuple(band.shape), np.uint8)
+    inputs = (
+        stack.heightmap, stack.empty_map, stack.boxes, stack.loads, stack.count,
+        item.sides, item.centres(), item.weights(),
+        torch.from_numpy(shifts), torch.from_numpy(whole), band,
+    )  # fmt: skip
+    _solve_band(*(tensor.cpu().contiguous().numpy() for tensor in inputs), verdict)
+    for b, a, x, y in np.argwhere(verdict == UNSURE).tolist():
+        verdict[b, a, x, y] = _stands_by_highs(stack, item, b, a, x, y, shifts)
+    return sure | torch.from_numpy(verdict == YES).to(device)
+
+
+def _stands_by_highs(
+    stack: Bins,
+    item: OrientedItem,
+    b: int,
+    a: int,
+    x: int,
+    y: int,
+    shifts: NDArray[np.float64],
+) -> bool:
+    """Decide one cell by the linear program of the whole stack."""
+    k = int(stack.count[b])
+    w, d, h = item.sides[b, a].tolist()
+    z = int(stack.heightmap[b, x : x + w, y : y + d].max())
+    boxes = np.vstack((stack.boxes[b, :k].numpy(), (x, y, z, w, d, h)))
+    corner = np.array((x, y))
+    centre = corner + item.centres()[b, a].cpu().numpy()
+    weight = float(item.weights()[b])
+    loads = [
+        np.vstack((stack.loads[b, :k].numpy(), (weight, *(centre + shift)))) for shift in shifts
+    ]
+    return all(in_equilibrium(boxes, load) for load in loads)

@@ -1,0 +1,241 @@
+r"""The reduced linear program of one box placed on a stack in equilibrium, in compiled loops.
+
+:mod:`marl_pack.stability.static_equilibrium` solves the linear program of a whole stack. A mask
+asks thousands of such questions about stacks that stand, so the program is reduced:
+
+- *Solid cells.* Where the column below a contact cell is filled to the floor, a force there can be
+  passed straight down through the column without disturbing any box in it. Letting the ground push
+  at the corners of those cells adds no wrench that the contacts could not already produce, so the
+  cone is unchanged.
+- *Grounded boxes.* Call a box grounded if all columns below it are filled and all boxes it rests on
+  are grounded or the floor. Let :math:`C` be the cone, :math:`C_g` the cone of the grounded boxes'
+  own ground forces and :math:`C'` the cone left when grounded boxes are replaced by ground. A
+  grounded box touches others only from below, at solid cells, so deleting its rows from :math:`A`
+  turns each such contact into a ground contact: the projection of :math:`C` is :math:`C'`, and
+  :math:`C \supseteq C_g \times C'`. Each grounded weight is interior to :math:`C_g`. Hence
+  :math:`w \in \operatorname{int} C \iff w' \in \operatorname{int} C'`.
+- *Components.* Boxes that no chain of contacts through ungrounded boxes joins to the new one keep
+  the balance they had: the cone is a product.
+
+What remains (a handful of boxes) goes to a small dense simplex, whose forces are put back into the
+equations; where they do not confirm its verdict, it is UNSURE.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from marl_pack.geometry.compiled import place_box
+from marl_pack.stability.hull_exact import envelope, row_extremes
+from marl_pack.stability.simplex import max_least_force
+from marl_pack.stability.static_equilibrium import STRICT
+
+NO, YES, UNSURE = 0, 1, 2
+
+
+@njit(cache=True)
+def _overlap(a: Any, b: Any) -> tuple[int, int, int, int]:
+    """Return the rectangle x0, y0, x1, y1 that two boxes share seen from above.
+
+    It is empty if x1 <= x0 or y1 <= y0.
+    """
+    return (
+        max(a[0], b[0]),
+        max(a[1], b[1]),
+        min(a[0] + a[3], b[0] + b[3]),
+        min(a[1] + a[4], b[1] + b[4]),
+    )
+
+
+@njit(cache=True)
+def _touches(a: Any, b: Any) -> bool:
+    """Return whether box ``a`` rests on box ``b``."""
+    if a[2] != b[2] + b[5]:
+        return False
+    x0, y0, x1, y1 = _overlap(a, b)
+    return x0 < x1 and y0 < y1
+
+
+@njit(cache=True)
+def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
+    """Find where the ground pushes at a box: the vertices of the hull of its bearing cells.
+
+    Args:
+        bearing: bool [w, d], contact cells over columns that are filled to the floor.
+        scratch: int64 [3, ≥ 2w + 2, 2].
+        points: float64 [≥ 4w + 4, 2], written: the vertices (x, y) from the box's low corner.
+
+    Returns:
+        The number of vertices.
+    """
+    w = bearing.shape[0]
+    lo, hi, upper, lower = scratch[0, :, 0], scratch[0, :, 1], scratch[1], scratch[2]
+    row_extremes(bearing, lo, hi)
+    n_upper, n_lower = envelope(lo[:w], hi[:w], upper, lower)
+    for i in range(n_upper):
+        points[i, 0], points[i, 1] = upper[i, 0], upper[i, 1]
+    for i in range(n_lower):
+        points[n_upper + i, 0], points[n_upper + i, 1] = lower[i, 0], lower[i, 1]
+    return n_upper + n_lower
+
+
+@njit(cache=True)
+def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing: Any) -> bool:
+    """Mark the cells of a window that touch a box resting at ``z`` and bear.
+
+    Args:
+        heightmap: integers [W, D].
+        empty_map: integers [W, D].
+        x: the window's low corner along W.
+        y: the window's low corner along D.
+        z: the resting height.
+        bearing: bool [w, d], written.
+
+    Returns:
+        Whether all cells do.
+    """
+    full = True
+    for i in range(bearing.shape[0]):
+        for j in range(bearing.shape[1]):
+            bearing[i, j] = heightmap[x + i, y + j] == z and empty_map[x + i, y + j] == 0
+            full &= bearing[i, j]
+    return full
+
+
+@njit(cache=True)
+def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[Any, Any, Any]:
+    """Replay a stack: find its grounded boxes, and where the ground pushes at the others.
+
+    Args:
+        boxes: int64 [≥ n, 6], rows x, y, z, w, d, h in order of placement.
+        n: number of boxes.
+        shape: (W, D).
+        scratch: int64 [3, 2W + 2, 2].
+
+    Returns:
+        Grounded boxes bool [n + 1], ground points float64 [n + 1, 4W + 4, 2] and their number
+        int64 [n + 1]; the last row of each is left for a new box.
+    """
+    heightmap = np.zeros(shape, np.int64)
+    empty_map = np.zeros(shape, np.int64)
+    grounded = np.zeros(n + 1, np.bool_)
+    points = np.zeros((n + 1, 4 * shape[0] + 4, 2))
+    count = np.zeros(n + 1, np.int64)
+    bearing = np.empty(shape, np.bool_)
+    for k in range(n):
+        x, y, z, w, d, h = boxes[k]
+        cells = bearing[:w, :d]
+        whole = mark_bearing(heightmap, empty_map, x, y, z, cells)
+        place_box(heightmap, empty_map, x, y, w, d, h)
+        for j in range(k):
+            if whole and not grounded[j] and _touches(boxes[k], boxes[j]):
+                whole = False
+        grounded[k] = whole
+        if not whole:
+            count[k] = ground_points(cells, scratch, points[k])
+    return grounded, points, count
+
+
+@njit(cache=True)
+def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tuple[Any, Any, int]:
+    """Find the boxes that the new box ``n`` may disturb.
+
+    Returns:
+        These boxes int64 [S] in the order of their rows in the system, the row of each box
+        int64 [n + 1] (-1: not in it), and the number of forces that act on them.
+    """
+    row = np.full(n + 1, -1, np.int64)
+    queue = np.empty(n + 1, np.int64)
+    size, head = 1, 0
+    queue[0], row[n] = n, 0
+    if whole:
+        for j in range(n):
+            if not grounded[j]:
+                queue[size], row[j] = j, size
+                size += 1
+    forces = 0
+    while head < size:
+        i = queue[head]
+        head += 1
+        forces += count[i]
+        for j in range(n + 1):
+            if j == i or grounded[j]:
+                continue
+            below = _touches(boxes[i], boxes[j])
+            if below:
+                forces += 4
+            if row[j] < 0 and (below or _touches(boxes[j], boxes[i])):
+                queue[size], row[j] = j, size
+                size += 1
+    return queue[:size], row, forces
+
+
+@njit(cache=True)
+def _system(
+    boxes: Any, loads: Any, grounded: Any, points: Any, count: Any, members: Any, row: Any,
+    forces: int,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Build the equations ``a f = weight`` of the members' balance of force and moments.
+
+    Weights are in mean weights of the members, moments in each box's longer side.
+    """
+    size, n = members.size, grounded.size
+    a = np.zeros((3 * size, forces))
+    weight = np.zeros(3 * size)
+    mean = 0.0
+    for k in range(size):
+        mean += loads[members[k], 0] / size
+    c = 0
+    for k in range(size):
+        i = members[k]
+        reach = float(max(boxes[i, 3], boxes[i, 4]))
+        weight[3 * k] = loads[i, 0] / mean
+        for p in range(count[i]):
+            a[3 * k, c] = 1.0
+            a[3 * k + 1, c] = (boxes[i, 0] + points[i, p, 0] - loads[i, 1]) / reach
+            a[3 * k + 2, c] = (boxes[i, 1] + points[i, p, 1] - loads[i, 2]) / reach
+            c += 1
+        for j in range(n):
+            if j == i or grounded[j] or not _touches(boxes[i], boxes[j]):
+                continue
+            m = row[j]
+            other = float(max(boxes[j, 3], boxes[j, 4]))
+            x0, y0, x1, y1 = _overlap(boxes[i], boxes[j])
+            for px, py in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
+                a[3 * k, c] = 1.0
+                a[3 * k + 1, c] = (px - loads[i, 1]) / reach
+                a[3 * k + 2, c] = (py - loads[i, 2]) / reach
+                a[3 * m, c] = -1.0
+                a[3 * m + 1, c] = -(px - loads[j, 1]) / other
+                a[3 * m + 2, c] = -(py - loads[j, 2]) / other
+                c += 1
+    return a, weight
+
+
+@njit(cache=True)
+def stands(
+    boxes: Any, loads: Any, n: int, grounded: Any, points: Any, count: Any, whole: bool
+) -> int:
+    """Decide whether box ``n``, placed on the boxes before it, leaves them in strict equilibrium.
+
+    Args:
+        boxes: int64 [n + 1, 6], rows x, y, z, w, d, h.
+        loads: float64 [n + 1, 3], weight and x, y of each centre of mass.
+        n: index of the new box.
+        grounded: bool [n + 1], as from :func:`survey`.
+        points: float64 [n + 1, V, 2], ground points of each box.
+        count: int64 [n + 1], their number.
+        whole: whether to solve all ungrounded boxes, not only those that the new one may disturb.
+
+    Returns:
+        NO, YES or UNSURE, where the simplex cannot be trusted.
+    """
+    members, row, forces = _component(boxes, n, grounded, count, whole)
+    a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
+    force, sound = max_least_force(a, weight, 1e3 * STRICT)
+    if not sound:
+        return UNSURE
+    return YES if force > STRICT else NO

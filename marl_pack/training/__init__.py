@@ -1,0 +1,1 @@
+"""A training run: assembled from its settings, its folder, and its progress on the terminal."""

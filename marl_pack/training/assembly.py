@@ -1,0 +1,242 @@
+"""A training run from its settings: the games, the agents and the runner."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from marl_pack.agents.afterstates.critic import AfterstateCritic
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.learning.runner import Runner
+from marl_pack.agents.loading import Loader, record_of
+from marl_pack.agents.networks.kinds import JOINT, TWO_AGENTS, observe
+from marl_pack.bins import check_device
+from marl_pack.config import Agent, Config, ConfigError
+from marl_pack.evaluation.rollout import play
+from marl_pack.evaluation.statistics import mean_utilization
+from marl_pack.game.packing import Packing
+from marl_pack.items import Stream, choose_stream
+from marl_pack.vec_env import PackingVecEnv
+
+
+def rank() -> int:
+    """Return this process's number among those that torchrun started; 0 alone."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def local_device(config: Config) -> str:
+    """Return the device of this process."""
+    if config.device == "cuda" and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        return f"cuda:{os.environ['LOCAL_RANK']}"
+    return config.device
+
+
+def derived_seed(*parts: int) -> int:
+    """Return a seed of its own for each process; none that a user would give to an evaluation."""
+    low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
+    return int(high >> 1) << 32 | int(low)
+
+
+def make_stream(config: Config) -> Stream:
+    """Return the items of the game.
+
+    Raises:
+        ConfigError: if they do not go with the bin.
+    """
+    game = config.game
+    try:
+        return choose_stream(game.items, game.bin, game.sides)[0]
+    except ValueError as error:
+        raise ConfigError(f"game.items: {error}") from None
+
+
+def make_game(
+    config: Config, n: int, seed: int, *, auto_reset: bool, device: str, first_episode: int = 0
+) -> Packing:
+    """Return G = ``n`` games as the settings say."""
+    return Packing(
+        n, items=make_stream(config), spec=config.game, auto_reset=auto_reset, device=device,
+        seed=seed, first_episode=first_episode,
+    )  # fmt: skip
+
+
+def agents_of(config: Config) -> dict[str, Agent]:
+    """Return the settings of the agents that play, by name, in the order of their turns."""
+    if config.joint:
+        return {JOINT: config.placement}
+    return {name: getattr(config, name) for name in TWO_AGENTS}
+
+
+def other_agents(
+    config: Config, checkpoint: Mapping[str, Any] | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the records of the frozen agents and of the teachers, by the agents' names.
+
+    Args:
+        config: the settings.
+        checkpoint: of the run to resume, which holds them; a teacher only while it is cloned.
+
+    Raises:
+        ConfigError: naming the key, if an agent is not to be had.
+    """
+    records: dict[str, dict[str, Any]] = {"policy": {}, "teacher": {}}
+    for name, agent in agents_of(config).items():
+        for key, source in (("policy", agent.policy), ("teacher", agent.teacher)):
+            if source is None:
+                continue
+            if checkpoint is not None:
+                stored = checkpoint["agents"][name]
+                record = stored if agent.frozen else stored.get("teacher")
+            else:
+                try:
+                    record = record_of(source, name)
+                except (ValueError, FileNotFoundError) as error:
+                    raise ConfigError(f"{name}.{key}: {error}") from None
+            if record is not None:
+                records[key][name] = record
+    return records["policy"], records["teacher"]
+
+
+def runner_settings(
+    config: Config, frozen: Mapping[str, Any], teachers: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what :class:`marl_pack.agents.learning.runner.Runner` takes, from the settings.
+
+    Args:
+        config: the settings.
+        frozen, teachers: records, as :func:`other_agents` returns them.
+    """
+    ppo = asdict(config.ppo)
+    steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
+    symmetry, final_entropy = ppo.pop("symmetry"), ppo.pop("final_entropy_coef")
+    ppo.pop("num_envs")
+    schedule = ppo.pop("schedule")
+    ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
+
+    def learner(name: str, own: Agent) -> dict[str, Any]:
+        rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
+        entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
+        last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef
+        return {
+            "network": asdict(own.network),
+            "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
+            "symmetry": symmetry,
+            "teacher": teachers.get(name),
+            "teacher_iterations": own.teacher_iterations,
+            "schedule": {
+                "schedule": schedule, "learning_rate": rate, "entropy_coef": entropy,
+                "final_entropy_coef": entropy if last is None else last,
+            },
+        }  # fmt: skip
+
+    logger: str | dict[str, Any] = "tensorboard"
+    if config.output.logger == "wandb":
+        logger = {"class_name": "WandbLogWriter", "project_name": config.output.wandb_project}
+    return {
+        "num_steps_per_env": steps,
+        "save_interval": config.output.keep_every,
+        "check_for_nan": True,
+        "logger": logger,
+        "algorithm": {
+            "class_name": "marl_pack.agents.learning.ppo:PackingPPO", "iterations": iterations,
+        },
+        "agents": {
+            name: {"record": frozen[name]} if name in frozen else learner(name, own)
+            for name, own in agents_of(config).items()
+        },
+        "latest_every": config.output.latest_every,
+        "evaluate_every": config.evaluation.every,
+    }  # fmt: skip
+
+
+def make_runner(
+    config: Config,
+    folder: Path | None,
+    checkpoint: Mapping[str, Any] | None = None,
+    **reports: Callable[..., Any],
+) -> Runner:
+    """Return the runner of a run, resumed if a checkpoint is given.
+
+    Args:
+        config: the settings.
+        folder: of the run; None keeps no files.
+        checkpoint: of the run to resume.
+        **reports: ``evaluate``, ``show`` and ``evaluated`` of the runner.
+
+    Raises:
+        ConfigError: if a setting cannot be.
+    """
+    device = local_device(config)
+    try:
+        check_device(device)
+        torch.manual_seed(config.seed)
+        frozen, teachers = other_agents(config, checkpoint)
+        settings = runner_settings(config, frozen, teachers)
+        game = make_game(
+            config, config.ppo.num_envs, derived_seed(config.seed, rank()), auto_reset=True,
+            device=device,
+        )  # fmt: skip
+        check_symmetry(config, game)
+        planes = {
+            name: agent["network"]["planes"] if "network" in agent else []
+            for name, agent in settings["agents"].items()
+        }
+        sees_values = any("afterstate_value" in names for names in planes.values())
+        lookahead = Lookahead(AfterstateCritic().to(device) if sees_values else None)
+        loader = Loader(device, None, memo=lookahead.memo)
+        settings["algorithm"] |= {
+            "lookahead": lookahead,
+            "frozen": {name: loader.agent_of(record, name) for name, record in frozen.items()},
+            "teachers": {name: loader.agent_of(record, name) for name, record in teachers.items()},
+        }
+        first = next(iter(planes))
+        env = PackingVecEnv(
+            game, lambda games: observe(first, games, planes[first], lookahead), config
+        )
+        runner = Runner(env, settings, folder, device, config=config.to_dict(), **reports)
+        torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
+        if checkpoint is not None:
+            runner.resume(checkpoint)
+        elif config.init is not None:
+            runner.begin_with(checkpoints.read(config.init, device))
+    except (ValueError, FileNotFoundError) as error:
+        raise ConfigError(str(error)) from None
+    return runner
+
+
+def check_symmetry(config: Config, game: Packing) -> None:
+    """Refuse augmentation by symmetries where items may take o but not o ^ 1.
+
+    Raises:
+        ConfigError: naming the orientations of such items.
+    """
+    for orientations in game.orientation_sets if config.ppo.symmetry else ():
+        if {o ^ 1 for o in orientations} != set(orientations):
+            raise ConfigError(
+                f"ppo.symmetry = true: game.items has items with the orientations {orientations}; "
+                "each needs the pairs 0 1, 2 3 and 4 5 whole"
+            )
+
+
+def evaluation(config: Config, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Play the held-out sequences with a checkpoint's agents, each taking its best action."""
+    device = local_device(config)
+    policy = Loader(device, config.evaluation.seed).policy_of(checkpoint)
+
+    def game(n: int, first_episode: int) -> Packing:
+        return make_game(
+            config, n, config.evaluation.seed, auto_reset=False, device=device,
+            first_episode=first_episode,
+        )  # fmt: skip
+
+    stream = make_stream(config)
+    episodes = min(config.evaluation.episodes, stream.episodes or config.evaluation.episodes)
+    statistics = mean_utilization(play(policy, game, episodes))
+    return {"seed": config.evaluation.seed, **statistics}

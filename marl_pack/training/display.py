@@ -1,0 +1,75 @@
+"""Progress of a training run on the terminal."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from rich.text import Text
+
+from marl_pack.agents.learning.runner import Progress
+
+QUIET_SECONDS = 30.0  # between lines of progress where the output is not a terminal
+
+
+class Display:
+    """Shows progress on the terminal: a bar where there is one, else a line now and then."""
+
+    def __init__(self, console: Console, total: int, done: int) -> None:
+        self.console, self.total = console, total
+        self.live = console.is_terminal
+        self.bar = Bar(
+            TextColumn("iteration {task.completed:.0f}/{task.total:.0f}"), BarColumn(20),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=console,
+        )  # fmt: skip
+        self.text = Text()
+        self.view = Live(Group(self.bar, self.text), console=console, refresh_per_second=2)
+        self.task = self.bar.add_task("", total=total, completed=done)
+        self.shown_at = 0.0
+
+    def show(self, progress: Progress) -> None:
+        """Show an iteration that is done."""
+        lines = self.lines(progress)
+        self.bar.update(self.task, completed=progress.iteration)
+        self.text.plain = "\n".join(lines)
+        now = time.monotonic()
+        final = progress.iteration == self.total
+        if not self.live and (final or now - self.shown_at > QUIET_SECONDS):
+            self.shown_at = now
+            left = (self.total - progress.iteration) * progress.seconds / progress.iteration
+            self.console.print(
+                f"iteration {progress.iteration}/{self.total}  {'  '.join(lines)}  "
+                f"left {datetime.timedelta(seconds=round(left))}",
+                soft_wrap=True,
+            )
+
+    @staticmethod
+    def lines(progress: Progress) -> list[str]:
+        """Return speed, utilization and reward; then each learner's entropy and KL divergence."""
+        shown = [f"{progress.items_per_second:,.0f} items/s"]
+        if not math.isnan(progress.utilization):
+            shown.append(f"util {100 * progress.utilization:.1f} %")
+        if not math.isnan(progress.reward):
+            shown.append(f"reward {progress.reward:.3f}")
+        learned = []
+        for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses if "/" in key):
+            entropy, kl = (progress.losses[f"{name}/{what}"] for what in ("entropy", "kl"))
+            learned.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
+        return ["  ".join(shown), "  ".join(learned)]
+
+    def evaluated(self, row: Mapping[str, Any]) -> None:
+        """Show an evaluation that is done."""
+        spread = "" if row["low"] is None else f" ± {50 * (row['high'] - row['low']):.2f}"
+        self.console.print(
+            f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "
+            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f}{spread} "
+            f"% over {row['episodes']} episodes",
+            soft_wrap=True,
+        )

@@ -1,0 +1,119 @@
+"""The folder of a training run: what is written there, and how a run is resumed from it."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import marl_pack
+from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.config import Config, ConfigError, from_dict, parse
+from marl_pack.files import write_atomically
+
+PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
+MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
+
+
+def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
+    """Write the evaluations as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(history[-1]))
+    writer.writeheader()
+    writer.writerows(history)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+
+def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
+    """Write the settings, and the versions that ran them, beside the checkpoints."""
+    text = yaml.safe_dump(config.to_dict(), sort_keys=False)
+    write_atomically(folder / "config.yaml", lambda file: file.write(text.encode()))
+    versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
+    versions |= {name: metadata.version(name) for name in PACKAGES}
+    path = folder / "run.json"
+    before = json.loads(path.read_text()) if path.is_file() else None
+    record: dict[str, Any] = {
+        "arguments": list(arguments),
+        "seed": config.seed,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "processes": int(os.environ.get("WORLD_SIZE", "1")),
+        "versions": versions,
+    }
+    if before is not None:  # gone on with: keep how it began
+        before.setdefault("resumed", []).append(record)
+        record = before
+    record_text = json.dumps(record, indent=2) + "\n"
+    write_atomically(path, lambda file: file.write(record_text.encode()))
+
+
+def new_folder(config: Config) -> Path:
+    """Make the folder of a new run and return it; no two runs share one.
+
+    Raises:
+        ConfigError: if there is something in it, or it cannot be made.
+    """
+    name = config.output.name
+    if name is None:
+        name = f"{datetime.datetime.now():%Y-%m-%d_%H-%M-%S}_seed{config.seed}"
+    folder = Path(config.output.folder) / name
+    if (folder / checkpoints.LATEST).exists():
+        raise ConfigError(
+            f"output.name: {folder} holds a run; --resume {folder} goes on with it; or name another"
+        )
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise ConfigError(f"output.name: {folder} is there already; name another") from None
+    except OSError as error:
+        raise ConfigError(f"output.folder: {error}") from None
+    return folder
+
+
+def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]:
+    """Return the settings and the latest checkpoint of a run to resume.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: if it cannot be resumed so.
+    """
+    folder = Path(run)
+    try:
+        checkpoint = checkpoints.read(folder / checkpoints.LATEST if folder.is_dir() else folder)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    own = from_dict(checkpoint["config"])
+    config, options = parse(["--config", yaml.safe_dump(own.to_dict()), *arguments])
+    if len(options.config or []) > 1:
+        raise ConfigError("--resume: the run has its own settings; give no --config beside it")
+    before, after = _flat(own.to_dict()), _flat(config.to_dict())
+    for key, value in after.items():
+        if value != before[key] and not key.startswith(MAY_CHANGE):
+            raise ConfigError(
+                f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
+                "output.*, evaluation.* and ppo.max_iterations may change"
+            )
+    done = checkpoint["iter"] + 1
+    if config.ppo.max_iterations < min(done, own.ppo.max_iterations):
+        raise ConfigError(
+            f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
+        )
+    return config, checkpoint
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat

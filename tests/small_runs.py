@@ -1,0 +1,45 @@
+"""Small training runs, and their weights, for the tests of several modules."""
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from marl_pack.agents.learning.runner import Runner
+from marl_pack.config import Config, parse
+
+TINY = (
+    "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=16", "--ppo.num_steps_per_env=4",
+    "--ppo.num_mini_batches=2", "--evaluation.every=0", "--output.latest_every=1",
+    "--orientation.network.channels=8", "--orientation.network.layers=2",
+    "--placement.network.channels=8", "--placement.network.layers=2",
+)  # fmt: skip
+
+
+def tiny(*options: str) -> Config:
+    """Return the settings of a run that takes a moment."""
+    return parse([*TINY, *options])[0]
+
+
+def weights(runner: Runner, name: str) -> dict[str, Tensor]:
+    """Return copies of the weights of a learner's actor and critic."""
+    ppo = runner.alg.learners[name]
+    parts = {"actor": ppo.actor.state_dict(), "critic": ppo.critic.state_dict()}
+    return {f"{k}.{n}": v.clone() for k, s in parts.items() for n, v in s.items()}
+
+
+def rollout(runner: Runner) -> TensorDict:
+    """Play and record a rollout of four steps; return the observation after it."""
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(4):
+            actions = runner.alg.act(obs)
+            obs, *rest = runner.env.step(actions)
+            runner.alg.process_env_step(obs, *rest)
+    return obs
+
+
+def same(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> bool:
+    """Return whether two dicts hold the same tensors."""
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)

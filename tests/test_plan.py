@@ -1,0 +1,259 @@
+"""Plans: what they refuse, what they say, and that files of them read back as they were."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.game.packing import Packing
+from marl_pack.plan import COLUMNS, Plan
+from marl_pack.plan_archive import load_plans, save_plans
+
+BIN = (10, 10, 10)
+ROWS = [(0, 0, 0, 4, 4, 2), (1, 0, 2, 3, 4, 1)]
+PLAIN = Plan.of_boxes(BIN, ROWS)
+NAMED = Plan.of_boxes(
+    BIN, ROWS, [(3.25, 2.5, 2.0), (0.1, 1.5, 1 / 3)],
+    orientations=[4, -1], ids=('A "1", left', ""), unit_mm=12.5,
+)  # fmt: skip
+MILLIMETRES = Plan.of_boxes((400.0, 300, 200), np.array(ROWS) * 10.1, unit_mm=1.0)
+SEVERAL = Plan(
+    np.array([BIN, (5, 6, 7)]), np.array([1, 0, 1]), np.array([(0, 0, 0), (6, 6, 0), (0, 0, 2)]),
+    np.array([(2, 2, 2), (4, 4, 4), (1, 2, 3)]), np.array([0, 1, 5]), np.array([8.0, 1, 2]),
+    np.array([(1.0, 1), (8, 8), (0.5, 1)]), ("a", "b", "c"), 10.0,
+)  # fmt: skip
+NOTHING = Plan.of_boxes(BIN, [])
+ALL = (PLAIN, NAMED, MILLIMETRES, SEVERAL)
+
+
+def test_a_plan_says_what_its_boxes_are() -> None:
+    assert len(NAMED) == 2
+    assert NAMED.boxes.tolist() == [list(row) for row in ROWS]
+    assert NAMED.loads.tolist() == [[3.25, 2.5, 2.0], [0.1, 1.5, 1 / 3]]
+    assert PLAIN.loads.tolist() == [[32, 2, 2], [12, 2.5, 2]]
+    assert PLAIN.utilization == 44 / 1000
+    assert SEVERAL.utilization == (8 + 64 + 6) / (1000 + 210)
+    assert NOTHING.utilization == 0
+    assert PLAIN.sides.dtype == np.int64
+    assert MILLIMETRES.sides.dtype == MILLIMETRES.bin_sizes.dtype == np.float64
+    assert replace(NAMED) == NAMED
+    assert replace(NAMED, ids=("B", "")) != NAMED != PLAIN
+
+
+def test_a_plan_keeps_no_array_that_others_may_change() -> None:
+    boxes = np.array(ROWS)
+    plan = Plan.of_boxes(BIN, boxes)
+    boxes[:] = 9
+    assert plan == PLAIN
+    with pytest.raises(ValueError, match="read-only"):
+        plan.sides[0] = 1
+
+
+def test_parts_of_a_plan_are_plans() -> None:
+    assert [len(SEVERAL.first(k)) for k in range(4)] == [0, 1, 2, 3]
+    assert SEVERAL.first(3) == SEVERAL
+    own = SEVERAL.in_bin(1)
+    assert own.ids == ("a", "c")
+    assert own.bins.tolist() == [0, 0]
+    assert own.bin_sizes.tolist() == [[5, 6, 7]]
+    assert own.utilization == 14 / 210
+
+
+@pytest.mark.parametrize(("change", "why"), [
+    ({"bin_sizes": [(10, 10)]}, r"bin_sizes: shape \(1, 2\), needs \(1, 3\)"),
+    ({"bin_sizes": [(10, 10, 0)]}, "bin_sizes .*: needs positive sides"),
+    ({"bins": [0, 1]}, r"box 1 \(1, 0, 2, 3, 4, 1\): needs a bin from 0 to 0"),
+    ({"bins": [0.0, 0.5]}, "bins: needs whole numbers"),
+    ({"positions": [(0, 0, 0), (8, 0, 2)]}, r"box 1 \(8, .*: reaches out of its bin"),
+    ({"positions": [(0, 0, 0), (0, -1, 2)]}, "box 1 .*: reaches out"),
+    ({"positions": [(0, 0, 0), (0, np.nan, 2)]}, "positions: needs finite numbers"),
+    ({"sides": [(4, 4, 2), (0, 1, 1)]}, "box 1 .*: needs sides longer than 0"),
+    ({"sides": [(4, 4, 2)]}, r"sides: shape \(1, 3\), needs \(2, 3\)"),
+    ({"orientations": [0, 6]}, "box 1 .*: needs an orientation from 0 to 5, or -1"),
+    ({"weights": [1, 0]}, "box 1 .*: needs a positive weight"),
+    ({"weights": ["heavy", "light"]}, "weights: needs finite numbers"),
+    ({"centres": [(2, 2), (0.5, 1)]}, "box 1 .*: needs a centre of mass inside the box"),
+    ({"ids": ("a",)}, "ids: needs one text for each of 2 boxes"),
+    ({"ids": (1, 2)}, "ids: needs one text"),
+    ({"unit_mm": 0.0}, "unit_mm = 0.0: needs a positive length"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused_with_the_box_named(change: dict[str, object], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        replace(PLAIN, **change)  # type: ignore[arg-type]  # bad ones are meant
+
+
+def test_rows_that_are_no_boxes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"needs \[n, 6\]"):
+        Plan.of_boxes(BIN, [(1, 2, 3)])
+
+
+@pytest.mark.parametrize("plan", [*ALL, NOTHING, replace(SEVERAL, bins=np.zeros(3, np.int64))])
+def test_json_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    plan.to_json(path)
+    again = Plan.from_json(path)
+    assert again == plan
+    assert again.sides.dtype == plan.sides.dtype
+
+
+@pytest.mark.parametrize("plan", ALL)
+def test_csv_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
+    path = tmp_path / "plan.csv"
+    plan.to_csv(path)
+    again = Plan.from_csv(path)
+    assert again == plan
+    assert again.sides.dtype == plan.sides.dtype
+
+
+def test_a_line_of_csv_says_all_that_a_robot_needs(tmp_path: Path) -> None:
+    path = tmp_path / "plan.csv"
+    SEVERAL.to_csv(path)
+    header, first, *_ = path.read_text().splitlines()
+    assert header == ("id,bin,x,y,z,w,d,h,orientation,weight,centre_x,centre_y,"
+                      "bin_w,bin_d,bin_h,unit_mm")  # fmt: skip
+    assert first == "a,1,0,0,0,2,2,2,0,8.0,1.0,1.0,5,6,7,10.0"
+
+
+def test_an_empty_bin_is_not_written_as_csv(tmp_path: Path) -> None:
+    for plan in (NOTHING, replace(SEVERAL, bins=np.zeros(3, np.int64))):
+        with pytest.raises(ValueError, match=r"bin \d is empty.*JSON"):
+            plan.to_csv(tmp_path / "plan.csv")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("text", "why"), [
+    ("not json", "plan.json"),
+    ("[1]", "not a plan in JSON"),
+    ('{"bins": [[1, 1, 1]], "boxes": []}', "unit_mm"),
+    ('{"bins": [[1, 1, 1]], "unit_mm": null, "boxes": [{"id": "a"}]}', "bin"),
+    ('{"bins": [[1, 1]], "unit_mm": null, "boxes": []}', "bin_sizes: shape"),
+    ('{"bins": [[1, 1, 1]], "unit_mm": "cm", "boxes": []}', "not a plan in JSON"),
+])  # fmt: skip
+def test_json_that_is_no_plan_is_refused(text: str, why: str, tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=why) as refused:
+        Plan.from_json(path)
+    assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize(("change", "why"), [
+    (lambda lines: [], "needs the columns id,bin"),
+    (lambda lines: lines[:1], "and a line for a box"),
+    (lambda lines: ["a,b", *lines[1:]], "needs the columns"),
+    (lambda lines: [*lines[:2], "1,2"], "box 1: has 2 values, needs 16"),
+    (lambda lines: [lines[0], lines[1].replace("8.0", "heavy")], "box 0: .*heavy"),
+    (lambda lines: [*lines[:3], lines[3].replace("5,6,7", "5,6,8")], "box 2: bin 1 has another"),
+    (lambda lines: [*lines[:3], lines[3].replace("10.0", "")], "needs one unit"),
+    (lambda lines: lines[:2], "without a gap"),
+    (lambda lines: [lines[0], lines[2].replace("64", "1").replace("6,6,0", "7,6,0")], "out of its"),
+])  # fmt: skip
+def test_csv_that_is_no_plan_is_refused(
+    change: Callable[[list[str]], list[str]], why: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "plan.csv"
+    SEVERAL.to_csv(path)
+    path.write_text("\n".join(change(path.read_text().splitlines())))
+    with pytest.raises(ValueError, match=why) as refused:
+        Plan.from_csv(path)
+    assert str(path) in str(refused.value)
+
+
+def test_the_columns_of_csv_are_distinct() -> None:
+    assert len(set(COLUMNS)) == len(COLUMNS)
+
+
+@pytest.mark.parametrize("plans", [[PLAIN], [PLAIN, NAMED, NOTHING], list(ALL), [NOTHING]])
+def test_archives_read_back_as_they_were(plans: list[Plan], tmp_path: Path) -> None:
+    path = tmp_path / "plans.npz"
+    save_plans(path, plans)
+    again = load_plans(path)
+    assert again == plans
+    with np.load(path) as archive:
+        assert archive["count"].tolist() == [len(plan) for plan in plans]
+        assert archive["utilization"].tolist() == [plan.utilization for plan in plans]
+        one = all(len(plan.bin_sizes) == 1 and plan.bin_sizes[0, 0] == 10 for plan in plans)
+        assert (archive["bin"].tolist() == list(BIN)) == one
+        assert archive["boxes"].dtype == (np.int16 if one else np.float64)
+
+
+def test_no_plans_make_no_archive(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no plans"):
+        save_plans(tmp_path / "plans.npz", [])
+
+
+def test_archives_of_before_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "stacks.npz"
+    boxes = np.zeros((2, 2, 6), np.int16)
+    boxes[0], boxes[1, 0] = ROWS, ROWS[0]
+    loads = np.zeros((2, 2, 3))
+    loads[0], loads[1, 0] = PLAIN.loads, PLAIN.loads[0]
+    np.savez_compressed(path, bin=np.array(BIN), count=np.array([2, 1]), boxes=boxes, loads=loads,
+                        utilization=np.array([0.044, 0.032]))  # fmt: skip
+    assert load_plans(path) == [PLAIN, PLAIN.first(1)]
+
+
+def test_a_foreign_archive_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(ValueError, match="not a file of plans"):
+        load_plans(path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="not a file of plans"):
+        load_plans(path)
+    with pytest.raises(FileNotFoundError):
+        load_plans(tmp_path / "nowhere.npz")
+
+
+def test_an_archive_whose_arrays_do_not_go_together_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.npz"
+    good = {"bin": np.array(BIN), "count": np.array([1]), "boxes": np.array([ROWS[:1]]),
+            "loads": np.array([[(32.0, 2, 2)]]), "utilization": np.array([0.032])}  # fmt: skip
+    np.savez(path, **good)
+    assert load_plans(path) == [PLAIN.first(1)]
+    for name, value in (("count", [-1]), ("count", [2]), ("count", [1, 1]), ("bin", [10.5, 1, 1]),
+                        ("boxes", [[ROWS[0][:5]]]), ("loads", [[(1.0, 1)]]),
+                        ("orientations", [1]), ("unit_mm", [1.0, 1.0]),
+                        ("bin", [[(10, 10, 10)]] * 2)):  # fmt: skip
+        np.savez(path, **{**good, name: np.array(value)})
+        with pytest.raises(ValueError, match="do not go together"):
+            load_plans(path)
+    np.savez(path, **{**good, "boxes": np.array([[(9, 0, 0, 2, 2, 2)]])})
+    with pytest.raises(ValueError, match=r"episode 0: box 0 .*: reaches out"):
+        load_plans(path)
+
+
+def test_a_plan_of_a_game_is_what_stands_in_its_bin() -> None:
+    game = Packing(3, seed=1, com_offset=(0.1, 0, 0), auto_reset=False)
+    policy = make_policy("dblf")
+    while bool(game.alive.any()):
+        game.place(*policy(game))
+    plans = [Plan.from_bins(game.bins, k, unit_mm=60.0) for k in range(3)]
+    for k, plan in enumerate(plans):
+        n = int(game.bins.count[k])
+        assert len(plan) == n
+        assert torch.equal(torch.from_numpy(plan.boxes), game.bins.boxes[k, :n].long())
+        assert torch.equal(torch.from_numpy(plan.loads), game.bins.loads[k, :n])
+        assert plan.utilization == float(game.bins.filled[k]) / 1000
+        assert plan.unit_mm == 60
+
+
+class Labelled:
+    """A state of one bin that knows which items its boxes are."""
+
+    size = BIN
+    count = torch.tensor([2])
+    boxes = torch.tensor([ROWS])
+    loads = torch.from_numpy(PLAIN.loads)[None]
+    labels = torch.tensor([[(1, 3), (-1, -1)]])
+
+
+def test_labels_of_a_state_become_ids_and_orientations() -> None:
+    plan = Plan.from_bins(Labelled(), 0, id_names=("first", "second"))  # type: ignore[arg-type]  # all that is read
+    assert plan.ids == ("second", "")
+    assert plan.orientations.tolist() == [3, -1]
+    assert Plan.from_bins(Labelled(), 0).ids == ("1", "")  # type: ignore[arg-type]  # the same

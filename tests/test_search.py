@@ -1,0 +1,201 @@
+"""Search: imagined games follow the rules, futures are drawn, and looking ahead helps."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from marl_pack.agents import search
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.networks.actor_critic import make_actor, make_critic
+from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.evaluation.rollout import play
+from marl_pack.game.packing import Packing
+from marl_pack.items import make_stream
+
+SIZE = (6, 6, 6)
+NETWORK = {"channels": 8, "layers": 2}
+FUTURES = make_stream("rs", SIZE, (1, 3))
+Agents = tuple[LearnedAgent, LearnedAgent]
+
+
+def game(n: int, first_episode: int = 0, **options: Any) -> Packing:
+    settings = {"sides": (1, 3), "auto_reset": False, "seed": 4} | options
+    return Packing(n, SIZE, first_episode=first_episode, **settings)
+
+
+@pytest.fixture(scope="module")
+def agents() -> Agents:
+    torch.manual_seed(0)
+    lookahead = Lookahead()
+    first, second = (
+        LearnedAgent(kind, make_actor(kind, NETWORK, "cpu").eval(), lookahead)
+        for kind in ("orientation", "placement")
+    )
+    return first, second
+
+
+def utilization(policy: Policy, episodes: int = 24) -> float:
+    return float(play(policy, game, episodes).utilization.mean())
+
+
+def test_a_branch_plays_on_like_the_game_it_comes_from() -> None:
+    policy = make_policy("dblf")
+    whole = game(5)
+    for _ in range(6):
+        whole.place(*policy(whole))
+    state = whole.state_dict()
+    which = torch.tensor([3, 1, 3])
+    part = whole.branch(which)
+    for _ in range(4):
+        part.place(*policy(part))
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, state[name]), name
+    for _ in range(4):
+        whole.place(*policy(whole))
+    assert torch.equal(part.bins.heightmap, whole.bins.heightmap[which])
+    for name, values in whole.items.tensors().items():
+        assert torch.equal(part.items.tensors()[name], values[which]), name
+    assert torch.equal(part.alive, whole.alive[which])
+
+
+def test_a_branch_shows_its_item_and_then_those_of_another_stream() -> None:
+    whole = game(2)
+    whole.place(*make_policy("dblf")(whole))
+    stream = make_stream([[1, 1, 1], [2, 2, 2], [3, 3, 3]], SIZE)
+    part = whole.branch(torch.tensor([0, 0]), stream, seed=0, episodes=torch.tensor([0, 0]))
+    assert torch.equal(part.items.sides[0], whole.items.sides[0])
+    part.place(*make_policy("dblf")(part))
+    assert part.items.sides.tolist() == [[3, 3, 3], [3, 3, 3]]
+
+
+def test_searching_beats_the_same_agents_without(agents: Agents) -> None:
+    alone = in_turns(*agents)
+    planner = Planner(*agents, None, SearchSettings(rollouts=3, top=6), FUTURES)
+    assert utilization(planner) > utilization(alone) + 0.03
+
+
+def test_a_critic_may_value_what_comes_after_a_depth(agents: Agents) -> None:
+    batches: list[int] = []
+
+    class FlatTops(torch.nn.Module):
+        """A critic that prefers flat tops."""
+
+        def forward(self, observation: dict[str, Tensor]) -> Tensor:
+            batches.append(len(observation["item"]))
+            return -observation["heightmap"].double().flatten(1).std(1, keepdim=True)
+
+    settings = SearchSettings(rollouts=2, top=6, depth=1)
+    planner = Planner(*agents, FlatTops(), settings, FUTURES)  # type: ignore[arg-type]  # a stand-in
+    assert utilization(planner) > utilization(in_turns(*agents)) + 0.03
+    assert max(batches) > 6  # pairs times futures times games
+
+
+def test_a_decision_does_not_depend_on_the_batch(agents: Agents) -> None:
+    planner = Planner(*agents, None, SearchSettings(rollouts=2, top=3), FUTURES, seed=5)
+    together = game(4)
+    chosen = torch.stack(planner(together), 1)
+    for i in range(4):
+        assert torch.equal(torch.stack(planner(game(1, i)), 1)[0], chosen[i])
+
+
+def test_pairs_share_their_futures_and_no_future_is_what_comes(
+    agents: Agents, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    branches: list[Packing] = []
+    branch = Packing.branch
+
+    def spied(self: Packing, *arguments: Any) -> Packing:
+        branches.append(branch(self, *arguments))
+        return branches[-1]
+
+    monkeypatch.setattr(Packing, "branch", spied)
+    real = game(1, 2, seed=0)
+    Planner(*agents, None, SearchSettings(rollouts=4, top=3), FUTURES, seed=0)(real)
+    imagined = (one for one in branches if one.n == 6 and one.seed < 0)
+    first, second = (one.state.stream for one in imagined)
+    drawn = []
+    for keys in (first.view(3, 2), second.view(2, 3)):  # 3 pairs, then the better 2
+        assert (keys == keys[0]).all()
+        drawn += keys[0].tolist()
+    assert len(set(drawn)) == 5
+    assert int(real.state.stream) not in drawn
+
+
+def test_orientations_that_give_the_same_box_count_as_one(
+    agents: Agents, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = Planner(*agents, None, SearchSettings(rollouts=1, top=200), FUTURES)
+
+    def proposed(**options: Any) -> list[int]:
+        cube = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, **options)
+        pairs, legal = planner._propose(cube, torch.tensor([0]))
+        proposals: list[int] = pairs[legal].tolist()
+        assert len(set(proposals)) == len(proposals)
+        return proposals
+
+    assert len(proposed()) == 4  # its places
+    assert {pair // 16 for pair in proposed(orientations=[2, 5])} == {2}
+    assert len(proposed(com_offset=(0.1, 0, 0))) == 24
+
+
+def test_a_game_with_few_pairs_or_at_its_end_is_searched_too(agents: Agents) -> None:
+    planner = Planner(*agents, None, SearchSettings(rollouts=2, top=64), FUTURES)
+    tight = Packing(3, (2, 2, 3), [[2, 2, 1], [2, 2, 1], [2, 2, 1]], auto_reset=False)
+    for _ in range(4):  # the last one plays bins that have ended
+        tight.place(*planner(tight))
+    assert not tight.alive.any()
+    assert (tight.bins.filled == 12).all()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "rollouts",
+        "rollouts=0",
+        "top=-1",
+        "k=3",
+        "rollouts=2;top=3",
+        "",
+        "rollouts=²",
+        "top=3,top=4",
+        "rollouts=99999999999999999999",
+        "rollouts=1000000,top=4",
+    ],
+)
+def test_settings_that_cannot_be_read_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="plan"):
+        SearchSettings.parse(text)
+
+
+def test_settings_are_read_and_shown() -> None:
+    assert SearchSettings.parse("rollouts=3, top=2") == SearchSettings(3, 2)
+    assert str(SearchSettings.parse("top=2,depth=4")) == "plan rollouts=16,top=2,depth=4"
+
+
+def test_a_single_legal_pair_is_taken_without_imagining(
+    agents: Agents, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Planner, "_imagine", None)
+    full = Packing(2, (3, 3, 3), [[3, 3, 3]], auto_reset=False)
+    choice = Planner(*agents, None, SearchSettings(rollouts=2, top=4), FUTURES)(full)
+    full.place(*choice)
+    assert (full.bins.filled == 27).all()
+
+
+def test_the_work_may_be_split_into_parts(agents: Agents, monkeypatch: pytest.MonkeyPatch) -> None:
+    planner = Planner(*agents, None, SearchSettings(rollouts=3, top=5), FUTURES)
+    at_once = torch.stack(planner(game(3)))
+    monkeypatch.setattr(search, "AT_ONCE", 7 * 36)  # seven bins
+    assert torch.equal(torch.stack(planner(game(3))), at_once)
+
+
+def test_a_depth_needs_a_critic(agents: Agents) -> None:
+    with pytest.raises(ValueError, match="critic"):
+        Planner(*agents, None, SearchSettings(depth=2), FUTURES)
+    critic = make_critic("orientation", NETWORK, "cpu", agents[0].actor)
+    Planner(*agents, critic, SearchSettings(depth=2), FUTURES)
