@@ -40,7 +40,6 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +57,7 @@ from pettingzoo.utils.conversions import (
 
 from marl_pack.bins import ORIENTATIONS
 from marl_pack.game.packing import MOST_SKIPPED, Packing
-from marl_pack.game.spec import GameSpec, document
+from marl_pack.game.spec import GameSpec, document, with_options
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.plan import Plan
 
@@ -298,7 +297,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             self._chosen = choice
         else:
             self._place(self._chosen, choice)
-        self.agent_selection = PLACEMENT if agent == ORIENTATION else ORIENTATION
+        self.agent_selection = self._acting
         self._accumulate_rewards()
         self.infos = {name: self._info(name) for name in self.agents}
         if repaired:
@@ -334,7 +333,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             raise ValueError(
                 f"{agent}: action {action} is not legal; {len(legal)} are, see its action_mask"
             )
-        if agent == ORIENTATION:
+        if self._chosen is None:
             return int(legal[np.abs(legal - int(action)).argmin()]), True
         return self._game.floor.nearest(int(action), legal), True
 
@@ -349,6 +348,11 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self._item = game.items.sides.numpy()[0]
         self._masks = game.mask.numpy()[0]
         self._orientation_mask = game.orientation_mask.numpy()[0]
+
+    @property
+    def _acting(self) -> str:
+        """The agent whose turn it is: the placement agent once an orientation is chosen."""
+        return AGENTS[self._chosen is not None]
 
     def _sides(self, turned: bool) -> NDArray[np.int16]:
         """Return the item's sides: its own, or along x, y, z once an orientation is chosen."""
@@ -367,10 +371,11 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
     def action_mask(self, agent: str) -> NDArray[np.int8]:
         """Return the agent's legal actions; none when it is not its turn."""
         mask = np.zeros(self.action_spaces[agent].n, np.int8)
-        if agent == ORIENTATION and self._chosen is None:
-            mask[: len(ORIENTATIONS)] = self._orientation_mask
-        elif agent == PLACEMENT and self._chosen is not None:
-            mask[: self._heights.size] = self._masks[self._chosen].ravel()
+        if agent == self._acting:
+            legal = self._orientation_mask
+            if self._chosen is not None:
+                legal = self._masks[self._chosen].ravel()
+            mask[: legal.size] = legal
         return mask
 
     def _info(self, agent: str) -> dict[str, Any]:
@@ -424,27 +429,17 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return f"{self._packed} boxes, utilization {self.utilization:.1%}"
 
     def _text(self) -> str:
-        sides = " x ".join(map(str, self._sides(turned=True)))
-        heights = (self._heights * self._unit).round().astype(int)
-        digits = len(str(self._game.size[2]))
-        rows = [" ".join(f"{h:{digits}d}" for h in column) for column in heights.T[::-1]]
-        return "\n".join([self._title(), f"item {sides}", *rows]) + "\n"
+        from marl_pack.render.turn import turn_text
+
+        game, sides = self._game, self._sides(turned=True).tolist()
+        return turn_text(self._title(), sides, game.bins.heightmap.numpy()[0], game.size[2])
 
     def _picture(self) -> NDArray[np.uint8]:
-        from marl_pack.render.picture import (
-            draw,  # matplotlib is slow to import, and not always needed
-        )
+        from marl_pack.render.turn import turn_picture
 
-        sides = self._sides(turned=True)
-        chosen = range(len(ORIENTATIONS)) if self._chosen is None else [self._chosen]
-        turned = [" x ".join(str(self._item[axis]) for axis in ORIENTATIONS[o]) for o in chosen]
-        return draw(
-            self._game.size,
-            self._game.bins.boxes[0, : self._packed].numpy(),
-            (int(sides[0]), int(sides[1]), int(sides[2])) if sides.any() else None,
-            self._masks[list(chosen)],
-            turned,
-            self._title(),
+        boxes = self._game.bins.boxes[0, : self._packed].numpy()
+        return turn_picture(
+            self._title(), self._game.size, boxes, self._item.tolist(), self._masks, self._chosen
         )
 
     def close(self) -> None:
@@ -459,19 +454,4 @@ def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
         raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")
 
 
-def _signature() -> inspect.Signature:
-    """Return the signature of :class:`raw_env` with every option of the game by its name."""
-    own = inspect.signature(raw_env.__init__)
-    listed = [p for name, p in own.parameters.items() if name not in ("self", "options")]
-    options = [
-        inspect.Parameter(
-            option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default,
-            annotation=option.type,
-        )
-        for option in fields(GameSpec)
-        if option.name != "bin"
-    ]  # fmt: skip
-    return own.replace(parameters=[*listed, *options], return_annotation=inspect.Signature.empty)
-
-
-raw_env.__signature__ = _signature()
+raw_env.__signature__ = with_options(inspect.signature(raw_env), leave_out=("bin",))

@@ -203,3 +203,15 @@ def test_agents_learn_on_goods_that_stay_upright_and_symmetries_need_pairs(tmp_p
     path.write_text(json.dumps(rows))
     with pytest.raises(ConfigError, match=r"ppo\.symmetry = true: game\.items has items"):
         make_runner(parse(small)[0], None)
+
+
+def test_without_a_mask_of_orientations_an_item_still_bars_its_own() -> None:
+    # A bin of one column and two cells: an item 1 x 1 x 2 stands upright or has no place.
+    rows = {"items": [[1, 1, 2]] * 3, "upright": [True, False, True]}
+    game = Packing(1, (1, 1, 4), rows, mask_orientations=False, auto_reset=False)
+    assert game.orientation_mask[0].tolist() == [True, True, False, False, False, False]
+    game.place(torch.tensor([0]), torch.tensor([0]))
+    assert game.orientation_mask.all()
+    outcome = game.place(torch.tensor([2]), torch.tensor([0]))
+    assert bool(outcome.done)
+    assert int(outcome.placed) == 1

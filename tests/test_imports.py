@@ -25,7 +25,7 @@ LAYERS = (
 ONLY = {
     "sapien_check": {"bins", "files", "geometry", "plan", "sapien_check"},
     "env_aec": {"bins", "game", "geometry", "items", "plan", "render"},
-    "game": {"backend", "bins", "game", "geometry", "items", "plan", "stability"},
+    "game": {"backend", "bins", "game", "geometry", "items", "plan", "renamed", "stability"},
     "render": {"bins", "geometry", "render"},
 }
 

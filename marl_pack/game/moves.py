@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_pack.backend import Backend
+from marl_pack.bins import Bins
+from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS
+from marl_pack.items import Items
+from marl_pack.items.items import ALL_ORIENTATIONS
+from marl_pack.stability import OrientedItem, orient_item
 
 Numbers = TypeVar("Numbers", int, Tensor, NDArray[np.int64])
 
@@ -129,6 +134,69 @@ class Moves:
         if cell is None:
             return values[games, orientation]
         return values[games, orientation].flatten(1)[games, cell]
+
+
+class LegalMoves:
+    """Finds the legal placements of items under the options of a game.
+
+    Args:
+        spec: the options.
+        device: of the tensors.
+    """
+
+    def __init__(self, spec: GameSpec, device: torch.device) -> None:
+        self.spec, self.rule = spec, spec.make_rule()
+        self._barred = [o for o in ALL_ORIENTATIONS if o not in spec.orientations]
+        self._allowed = torch.tensor([o in spec.orientations for o in ALL_ORIENTATIONS])
+        self._allowed = self._allowed.to(device)  # [6]
+
+    def orient(self, items: Items) -> OrientedItem:
+        """Return items in their six orientations; those that may not be chosen get zero sides.
+
+        The game's options and the item's own attribute say which may be chosen.
+        """
+        oriented = orient_item(items.sides, items.weights, self.spec.com_offset)
+        if self._barred:
+            oriented.sides[:, self._barred] = 0
+        if items.orientations is not None:
+            oriented.sides.masked_fill_(~items.orientations[..., None], 0)
+        return oriented
+
+    def moves(self, bins: Bins, items: Items, lost: Tensor | None = None) -> Moves:
+        """Return the legal moves of one item [G] in each bin.
+
+        Args:
+            bins: G bins.
+            items: the items [G].
+            lost: bool [G], games that an orientation without a legal cell has ended.
+        """
+        mask = self.rule(bins, self.orient(items))
+        if lost is not None and not self.spec.mask_orientations:
+            mask &= ~lost[:, None, None, None]
+        if self.spec.max_items is not None:
+            mask &= (bins.count < self.spec.max_items)[:, None, None, None]
+        return Moves(mask)
+
+    def choices(self, moves: Moves, items: Items) -> tuple[Tensor, Tensor]:
+        """Return the orientations that may be chosen, and whether the game goes on.
+
+        Without ``mask_orientations`` all that the game and the item allow may be chosen, as long as
+        one of them has a legal cell.
+
+        Args:
+            moves: the legal moves of the items.
+            items: the items [G].
+
+        Returns:
+            Bool [G, 6] and bool [G].
+        """
+        possible = moves.orientations
+        alive = possible.any(1)
+        if not self.spec.mask_orientations:
+            possible = self._allowed & alive[:, None]
+            if items.orientations is not None:
+                possible &= items.orientations
+        return possible, alive
 
 
 @njit(cache=True)

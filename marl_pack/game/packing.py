@@ -13,7 +13,6 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,42 +23,19 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import Bins, check_device, orientation_table
-from marl_pack.game.moves import Floor, Moves
+from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import GameState
+from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.plan import Plan
-from marl_pack.stability import OrientedItem, orient_item
+from marl_pack.stability import OrientedItem
 
 MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
 
 _turns = itertools.count()
-
-
-@dataclass(frozen=True)
-class Oriented:
-    """What the placement turn is shown once an orientation is chosen."""
-
-    sides: Tensor  # int16 [G, 3]    the item's sides along x, y, z
-    mask: Tensor  # bool [G, W, D]   the cells where it may be placed
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of placing an item in each game."""
-
-    reward: Tensor  # float32 [G]   Eq. 5
-    done: Tensor  # bool [G]        whether the episode ended with this placement
-    filled: Tensor  # int64 [G]     cells filled in the bin right after it, before any reset
-    placed: Tensor  # int64 [G]     boxes in the bin right after it
-    volume: int  # of a bin, in cells
-
-    @property
-    def utilization(self) -> Tensor:
-        """Share of each bin's volume filled right after the placement, float64 [G]."""
-        return self.filled.double() / self.volume
 
 
 @document(" " * 8)
@@ -128,14 +104,10 @@ class Packing:
         self.size = self.spec.bin
         width, depth, height = self.size
         self.floor, self.volume = Floor(width, depth), width * depth * height
-        self.rule = self.spec.make_rule()
+        self.legal = LegalMoves(self.spec, self.device)
         self.stream = make_stream(items, self.size, sides).to(self.device, self.backend)
         self.orientation_sets = _orientation_sets(self.stream, self.spec)
         self._games = torch.arange(n, device=self.device)
-        self._barred = [o for o in ALL_ORIENTATIONS if o not in self.spec.orientations]
-        self._allowed = torch.tensor(
-            [o not in self._barred for o in ALL_ORIENTATIONS], device=self.device
-        )  # [6]
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
         self.seed = seed
@@ -266,12 +238,7 @@ class Packing:
 
     def orient_item(self, items: Items) -> OrientedItem:
         """Return items in their six orientations; those that may not be chosen get zero sides."""
-        oriented = orient_item(items.sides, items.weights, self.spec.com_offset)
-        if self._barred:
-            oriented.sides[:, self._barred] = 0
-        if items.orientations is not None:
-            oriented.sides.masked_fill_(~items.orientations[..., None], 0)
-        return oriented
+        return self.legal.orient(items)
 
     def orient(self, orientation: Tensor) -> Oriented:
         """First turn: return what each item shows in an orientation. Changes nothing.
@@ -354,24 +321,11 @@ class Packing:
     # --- masks and episodes -----------------------------------------------------------------------
 
     def _find_moves(self) -> None:
-        """Make the masks of the visible items; a game where none is legal has ended."""
-        state = self.state
-        mask = self.rule(state.bins, self.orient_item(state.items))
-        if not self.spec.mask_orientations:
-            mask &= ~state.lost[:, None, None, None]
-        if self.spec.max_items is not None:
-            mask &= (state.bins.count < self.spec.max_items)[:, None, None, None]
+        """Find the legal moves of the visible items; a game without any has ended."""
         self.turn = next(_turns)
-        self.moves = Moves(mask)
-        self.orientation_mask, self.alive = self._choices(self.moves)
-
-    def _choices(self, moves: Moves) -> tuple[Tensor, Tensor]:
-        """Return the orientations that may be chosen, and whether the episode goes on."""
-        possible = moves.orientations
-        alive = possible.any(1)
-        if not self.spec.mask_orientations:
-            possible = self._allowed & alive[:, None]
-        return possible, alive
+        state = self.state
+        self.moves = self.legal.moves(state.bins, state.items, state.lost)
+        self.orientation_mask, self.alive = self.legal.choices(self.moves, state.items)
 
     def _restart(self, ended: Tensor) -> None:
         """Begin the next episode with a legal first item in the games that have ended, bool [G].
@@ -402,11 +356,11 @@ class Packing:
         bin_state.clear(state.bins, games)
         state.stream[games] = self.stream.start(self.seed, state.episode[games])
         items = self.stream.item(state.stream[games], state.t[games])
-        mask = self.rule(self._empty[: len(games)], self.orient_item(items))
+        moves = self.legal.moves(self._empty[: len(games)], items)
         for own, new in zip(state.items.tensors().values(), items.tensors().values(), strict=True):
             own[games] = new
-        self.mask[games] = mask
-        self.orientation_mask[games], self.alive[games] = self._choices(Moves(mask))
+        self.mask[games] = moves.mask
+        self.orientation_mask[games], self.alive[games] = self.legal.choices(moves, items)
 
     def _begin_by_mask(self, ended: Tensor) -> None:
         """Begin the next episode where ``ended``: every shape is fixed, so a device never waits."""
@@ -417,9 +371,9 @@ class Packing:
         bin_state.clear(state.bins, ended)
         state.stream = self.stream.restart(state.stream, self.seed, state.episode, ended)
         state.items = self.stream.item(state.stream, state.t)
-        mask = self.rule(self._empty, self.orient_item(state.items))
-        self.moves = Moves(torch.where(ended[:, None, None, None], mask, self.mask))
-        self.orientation_mask, self.alive = self._choices(self.moves)
+        new = self.legal.moves(self._empty, state.items).mask
+        self.moves = Moves(torch.where(ended[:, None, None, None], new, self.mask))
+        self.orientation_mask, self.alive = self.legal.choices(self.moves, state.items)
 
 
 def _orientation_sets(stream: Stream, spec: GameSpec) -> dict[tuple[int, ...], float]:

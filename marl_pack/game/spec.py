@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import inspect
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
 from typing import Any, TypeVar
@@ -244,11 +245,30 @@ def document(indent: str) -> Callable[[T], T]:
         for option in fields(GameSpec)
     )  # fmt: skip
 
-    def with_options(documented: T) -> T:
-        documented.__doc__ = (documented.__doc__ or "").replace("{options}", lines.strip())
-        return documented
+    def documented(owner: T) -> T:
+        owner.__doc__ = (owner.__doc__ or "").replace("{options}", lines.strip())
+        return owner
 
-    return with_options
+    return documented
+
+
+def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) -> inspect.Signature:
+    """Return a signature that names every option in place of ``**options``.
+
+    Args:
+        signature: of what takes options.
+        leave_out: options that it takes by another name.
+    """
+    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    options = [
+        inspect.Parameter(
+            option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default,
+            annotation=option.type,
+        )
+        for option in fields(GameSpec)
+        if option.name not in leave_out
+    ]  # fmt: skip
+    return signature.replace(parameters=[*own, *options])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,9 @@ from torch import Tensor, nn
 FORBIDDEN = -1e9
 """Logit of an action that is not legal: finite, so that no entropy or KL becomes NaN."""
 
+SCORES = {"orientation": (True, False), "placement": (False, True), "both": (True, True)}
+"""For each agent: whether its network scores orientations, and whether it scores cells."""
+
 
 class ActorCritic(nn.Module):
     """A network that turns one agent's planes and mask into logits and the state's value.
@@ -24,10 +27,11 @@ class ActorCritic(nn.Module):
 
     def __init__(self, agent: str, channels: int = 24) -> None:
         super().__init__()
-        if agent not in ("orientation", "placement", "both"):
-            raise ValueError(f"agent {agent!r}: one of orientation, placement, both")
+        if agent not in SCORES:
+            raise ValueError(f"agent {agent!r}: one of {', '.join(SCORES)}")
         self.agent = agent
-        planes = {"orientation": 4, "placement": 5, "both": 6}[agent]
+        self.scores_orientations, self.scores_cells = SCORES[agent]
+        planes = 4 + self.scores_cells + (self.scores_cells and self.scores_orientations)
         self.trunk = nn.Sequential(
             nn.Conv2d(planes, channels, 3, padding=1), nn.ReLU(),
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
@@ -53,18 +57,19 @@ class ActorCritic(nn.Module):
         """
         legal = mask.bool()
         batch, _, width, depth = planes.shape
-        if self.agent != "orientation":  # where the item may go says most
+        both = self.scores_orientations and self.scores_cells
+        if self.scores_cells:  # where the item may go says most
             cells = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
-            if self.agent == "both":
+            if both:
                 cells = cells * planes[:, 4:]  # in the orientation's turn the mask has no cells
             planes = torch.cat((planes, cells), 1)
         features = self.trunk(planes)
         pooled = torch.cat((features.mean((2, 3)), features.amax((2, 3))), 1)
-        if self.agent == "orientation":
+        if not self.scores_cells:
             logits = self.orientations(pooled)
         else:
             logits = self.cells(features).flatten(1)
-            if self.agent == "both":
+            if both:
                 logits = nn.functional.pad(logits, (0, mask.shape[1] - width * depth))
                 orientations = nn.functional.pad(self.orientations(pooled), (0, mask.shape[1] - 6))
                 logits = torch.where(planes[:, 4, 0, 0, None] > 0, logits, orientations)

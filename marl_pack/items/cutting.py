@@ -10,6 +10,7 @@ from numba import njit
 from torch import Tensor
 
 from marl_pack.bins import Size, check_size
+from marl_pack.geometry.compiled import place_box
 from marl_pack.items.random_numbers import draw, episode_keys
 
 
@@ -70,7 +71,7 @@ def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: A
 @njit(cache=True)
 def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out: Any) -> None:
     """Order the pieces by CUT-2: repeatedly draw one of those whose whole floor is built."""
-    height = np.zeros(shape, np.int64)
+    height, gaps = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     left = np.arange(n)
     ready = np.empty(n, np.int64)
     for k in range(n):
@@ -83,7 +84,7 @@ def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out
         i = ready[draw(state, count)]
         out[k] = pieces[left[i]]
         x, y, z, w, d, h = out[k]
-        height[x : x + w, y : y + d] = z + h
+        place_box(height, gaps, x, y, w, d, h)  # it rests at z, on its finished floor
         left[i : n - k - 1] = left[i + 1 : n - k].copy()
 
 

@@ -17,6 +17,7 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.agents.loading import Loader, record_of
 from marl_pack.agents.networks.kinds import JOINT, TWO_AGENTS, observe
+from marl_pack.agents.networks.planes import need_critic
 from marl_pack.bins import check_device
 from marl_pack.config import Agent, Config, ConfigError
 from marl_pack.evaluation.rollout import play
@@ -188,8 +189,8 @@ def make_runner(
             name: agent["network"]["planes"] if "network" in agent else []
             for name, agent in settings["agents"].items()
         }
-        sees_values = any("afterstate_value" in names for names in planes.values())
-        lookahead = Lookahead(AfterstateCritic().to(device) if sees_values else None)
+        critic = AfterstateCritic().to(device) if any(map(need_critic, planes.values())) else None
+        lookahead = Lookahead(critic)
         loader = Loader(device, None, memo=lookahead.memo)
         settings["algorithm"] |= {
             "lookahead": lookahead,

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainin
 from rich.progress import Progress as Bar
 from rich.text import Text
 
-from marl_pack.agents.learning.runner import Progress
+from marl_pack.agents.learning.logging import Progress
 
 QUIET_SECONDS = 30.0  # between lines of progress where the output is not a terminal
 

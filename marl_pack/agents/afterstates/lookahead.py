@@ -126,7 +126,7 @@ class Lookahead:
         """
         critic = self.critic
         if critic is None:
-            raise ValueError("the plane afterstate_value needs a critic of afterstates")
+            raise ValueError("values of placements need a critic of afterstates: give one")
 
         def compute() -> Tensor:
             afterstates, spec = self.afterstates(game), game.spec

@@ -29,6 +29,7 @@ from typing import Any
 import torch
 
 from marl_pack.agents.learning import migration
+from marl_pack.agents.networks.planes import need_critic
 from marl_pack.files import write_atomically
 
 FORMAT = 2
@@ -112,6 +113,6 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
         raise ValueError(f"the checkpoint has no {name} agent; it has: {agents}")
     parts = ("name", "network", "actor_state_dict", "afterstate_critic")
     record = {key: value for key, value in agent.items() if key in parts}
-    if "afterstate_value" in record.get("network", {}).get("planes", ()):
+    if need_critic(record.get("network", {}).get("planes", ())):
         record.setdefault("afterstate_critic", checkpoint.get("afterstate_critic"))
     return record

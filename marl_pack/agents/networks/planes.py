@@ -11,7 +11,7 @@ of the A orientations that the agent judges; [G, 1] is one number for the bin.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -86,6 +86,7 @@ class Plane:
             tensor that another gives too.
         channels: number of input channels for A orientations.
         encode: the observation → input channels, float32 [G, …, W, D] each.
+        needs_critic: whether a critic of afterstates has to be there.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Plane:
     observe: Callable[[Sight], dict[str, Tensor]]
     channels: Callable[[int], int]
     encode: Callable[[Observation], list[Tensor]]
+    needs_critic: bool = False
 
 
 def _shape(observation: Observation) -> torch.Size:
@@ -192,6 +194,7 @@ PLANES: dict[str, Plane] = {
             _observe_afterstate_value,
             lambda orientations: 2 * orientations + 1,
             _encode_afterstate_value,
+            needs_critic=True,
         ),
         Plane(
             "grounded",
@@ -211,6 +214,14 @@ PLANES: dict[str, Plane] = {
     )
 }
 """Every plane by its name."""
+
+
+def need_critic(planes: Iterable[str]) -> bool:
+    """Return whether any of the planes needs a critic of afterstates.
+
+    Unknown names count as no: they are refused where a network is built.
+    """
+    return any(name in PLANES and PLANES[name].needs_critic for name in planes)
 
 
 def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
