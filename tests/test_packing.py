@@ -358,6 +358,16 @@ def test_a_spec_and_keyword_options_make_the_same_game() -> None:
     assert Packing(2, spec=spec, margin=0.0).spec.margin == 0
 
 
+def test_options_take_numpy_numbers_and_become_plain() -> None:
+    spec = GameSpec(
+        orientations=np.array([2, 0]), max_items=np.int64(3), mask_orientations=np.bool_(True)
+    )
+    assert (spec.orientations, spec.max_items, spec.mask_orientations) == ((0, 2), 3, True)
+    assert all(type(o) is int for o in (*spec.orientations, spec.max_items))
+    with pytest.raises(ValueError, match="orientations"):
+        GameSpec(orientations=[True])
+
+
 def test_a_bin_holds_at_most_max_items() -> None:
     game, policy = Packing(8, max_items=3, auto_reset=False, seed=1), make_policy("dblf")
     counts = []

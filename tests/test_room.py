@@ -1,5 +1,6 @@
 """Afterstates against the meaning of their fields, and bits against masks."""
 
+import pickle
 from dataclasses import replace
 from itertools import permutations, product
 
@@ -164,6 +165,9 @@ def test_a_lookahead_belongs_to_one_turn_of_one_game() -> None:
     game.place(*make_policy("dblf")(game))
     assert not torch.equal(lookahead.feasible_cells(game), first)
     assert torch.equal(lookahead.feasible_cells(copy), first[[2, 0]])
+    again = pickle.loads(pickle.dumps(game))
+    assert torch.equal(lookahead.feasible_cells(again), lookahead.feasible_cells(game))
+    assert again.turn is not game.turn, "a copy in another process has turns of its own"
     state = game.state_dict()
     second = lookahead.feasible_cells(game)
     game.place(*make_policy("dblf")(game))

@@ -11,7 +11,6 @@ more items, or when the bin holds as many as it may.
 from __future__ import annotations
 
 import copy
-import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,8 +34,6 @@ from marl_pack.stability import OrientedItem
 MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
 
-_turns = itertools.count()
-
 
 @document(" " * 8)
 class Packing:
@@ -53,7 +50,7 @@ class Packing:
         mask: bool [G, 6, W, D], where the item may be placed in each orientation.
         orientation_mask: bool [G, 6], the orientations that may be chosen: those with a legal cell.
         alive: bool [G], false where an episode has ended (only without ``auto_reset``).
-        turn: a number that no other turn of this or another game has; it changes with the masks.
+        turn: an object that stands for this turn of these games: it changes with the masks.
         orientation_sets: which orientations items may take in this game, with the share of items
             that may take exactly those.
         n, size, volume, floor: G, (W, D, H), W · D · H, and the numbers of cells and pairs.
@@ -224,7 +221,7 @@ class Packing:
             branched.state.bins = branched.bins.for_boxes(most)
             branched.state.episode = episodes
             branched.state.stream = stream.start(seed, episodes)
-        branched.turn = next(_turns)
+        branched.turn = object()
         branched.moves = Moves(self.mask[games])
         branched.orientation_mask, branched.alive = self.orientation_mask[games], self.alive[games]
         return branched
@@ -322,7 +319,7 @@ class Packing:
 
     def _find_moves(self) -> None:
         """Find the legal moves of the visible items; a game without any has ended."""
-        self.turn = next(_turns)
+        self.turn = object()
         state = self.state
         self.moves = self.legal.moves(state.bins, state.items, state.lost)
         self.orientation_mask, self.alive = self.legal.choices(self.moves, state.items)

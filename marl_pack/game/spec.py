@@ -14,8 +14,10 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, TypeVar
+
+import numpy as np
 
 from marl_pack import renamed
 from marl_pack.bins import check_size
@@ -54,6 +56,10 @@ def _rule(value: Any) -> Any:
     raise ValueError(f"unknown stability rule {value!r}: one of {', '.join(RULES)}")
 
 
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise ValueError(f"{value!r}: needs a finite number")
@@ -74,22 +80,21 @@ def _thresholds(value: Any) -> str | None:
 
 def _orientations(value: Any) -> tuple[int, ...]:
     chosen = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    whole = all(isinstance(o, int) and not isinstance(o, bool) for o in chosen)
-    if not chosen or not whole or not set(chosen) <= set(ALL_ORIENTATIONS):
+    if not chosen or not all(map(_is_whole, chosen)) or not set(chosen) <= set(ALL_ORIENTATIONS):
         raise ValueError(f"{value!r}: need one or more of 0 … 5")
-    return tuple(sorted(set(chosen)))
+    return tuple(sorted({int(o) for o in chosen}))
 
 
 def _switch(value: Any) -> bool:
-    if not isinstance(value, bool):
+    if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{value!r}: needs true or false")
-    return value
+    return bool(value)
 
 
 def _max_items(value: Any) -> int | None:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+    if value is not None and not (_is_whole(value) and value >= 1):
         raise ValueError(f"{value!r}: needs a whole number ≥ 1, or none for no limit")
-    return value
+    return None if value is None else int(value)
 
 
 def _rule_name(rule: Any) -> str:

@@ -28,12 +28,12 @@ class Memo:
     """Results that are computed once a turn, for one turn of one game at a time."""
 
     def __init__(self) -> None:
-        self._turn = -1
+        self._turn: object = None
         self._results: dict[Any, Any] = {}
 
     def once(self, game: Packing, name: Any, compute: Callable[[], T]) -> T:
         """Return the result of this name in the game's turn; compute it if it is not there."""
-        if self._turn != game.turn:
+        if self._turn is not game.turn:
             self._turn, self._results = game.turn, {}
         if name not in self._results:
             self._results[name] = compute()
@@ -46,7 +46,7 @@ class Memo:
 
     def follow(self, game: Packing, games: Tensor, branched: Packing) -> None:
         """Carry the results over to the games ``games`` (int64 [K]) of ``game``, now a branch."""
-        if self._turn == game.turn:
+        if self._turn is game.turn:
             self._results = {
                 name: result.select(games) if isinstance(result, Afterstates) else result[games]
                 for name, result in self._results.items()
