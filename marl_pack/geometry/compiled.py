@@ -21,7 +21,7 @@ def place_box(
 
     Args:
         heightmap: integers [W, D], the top of each column.
-        empty_map: integers [W, D], the empty cells below each top.
+        empty_map: integers [W, D], the empty cells below each top; None where nobody needs it.
         x: the window's low corner along W.
         y: the window's low corner along D.
         w: the box's side along x, ≥ 1, as d along y and h along z. The window must lie inside the
@@ -41,7 +41,8 @@ def place_box(
     for i in range(x, x + w):
         for j in range(y, y + d):
             gap = z - heightmap[i, j]
-            empty_map[i, j] += gap
+            if empty_map is not None:
+                empty_map[i, j] += gap
             heightmap[i, j] = z + h
             waste += gap
     return z, waste

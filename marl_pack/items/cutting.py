@@ -71,7 +71,7 @@ def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: A
 @njit(cache=True)
 def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out: Any) -> None:
     """Order the pieces by CUT-2: repeatedly draw one of those whose whole floor is built."""
-    height, gaps = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    height = np.zeros(shape, np.int64)
     left = np.arange(n)
     ready = np.empty(n, np.int64)
     for k in range(n):
@@ -84,7 +84,7 @@ def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out
         i = ready[draw(state, count)]
         out[k] = pieces[left[i]]
         x, y, z, w, d, h = out[k]
-        place_box(height, gaps, x, y, w, d, h)  # it rests at z, on its finished floor
+        place_box(height, None, x, y, w, d, h)  # it rests at z, on its finished floor
         left[i : n - k - 1] = left[i + 1 : n - k].copy()
 
 

@@ -92,7 +92,7 @@ def _write_mask(codes: Any, out: Any) -> bool:
     return undecided != 0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _clear_unfit(sides: Any, width: int, depth: int, height: int, out: Any) -> None:
     """Empty the masks [N · A, W · D] of the oriented items that do not fit into the bin."""
     for i in range(sides.shape[0]):
@@ -100,7 +100,7 @@ def _clear_unfit(sides: Any, width: int, depth: int, height: int, out: Any) -> N
             out[i] = 0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _decide_run(
     window: Any, spare: Any, out: Any, depth: int, w: int, d: int, tops: Any, codes: Any
 ) -> None:
@@ -127,7 +127,7 @@ def _decide_run(
     codes[m:] = 0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _copy_equals(equal: Any, out: Any, best_level: Any) -> None:
     """Copy the results of oriented items [N · A] to those with equal sides.
 

@@ -19,7 +19,7 @@ LOOKUP_CELLS = 64
 """Windows of more cells than this find the extremes of their rows in tables of the whole map."""
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def row_extremes(cells: Any, lo: Any, hi: Any) -> None:
     """Find the first and the last cell of each row.
 
@@ -159,15 +159,15 @@ def _mark_neighbours(levels: Any, top: int, following: Any, preceding: Any) -> N
             following[x, y] = last
 
 
-@njit(cache=True)
-def _level_extremes(window: Any, top: int, lo: Any, hi: Any) -> None:
-    """Find the first and the last cell of level ``top`` in each row of a window [w, d]."""
-    w, d = window.shape
+@njit(cache=True, inline="always")
+def _level_extremes(
+    levels: Any, x: int, y: int, w: int, d: int, top: int, lo: Any, hi: Any
+) -> None:
+    """Find the first and the last cell of level ``top`` in each row of the window at (x, y)."""
     for i in range(w):
-        row = window[i]
         first, last = d, -1
         for j in range(d):
-            if row[j] == top:
+            if levels[x + i, y + j] == top:
                 first = min(first, j)
                 last = j
         lo[i], hi[i] = first, last
@@ -213,7 +213,7 @@ def solve_undecided(
                 lo[i] = following[cx + i, cy] - cy
                 hi[i] = preceding[cx + i, cy + d - 1] - cy
         else:
-            _level_extremes(levels[cx : cx + w, cy : cy + d], top, lo, hi)
+            _level_extremes(levels, cx, cy, w, d, top, lo, hi)
         if middle:
             out[cx, cy] = middle_inside(lo, hi, d)
         else:

@@ -43,7 +43,7 @@ def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
     return 0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _fill_hull(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
     """Fill ``cells`` [w, d] up to the hull of its true squares: whole squares only."""
     w, d = cells.shape
@@ -66,7 +66,6 @@ def _replay(boxes: Any, count: Any, out: Any) -> None:
     """Write the bearing columns [N, W, D] by placing the boxes [N, M, 6] one after the other."""
     n, width, depth = out.shape
     heightmap = np.empty((width, depth), np.int64)
-    empty_map = np.zeros((width, depth), np.int64)  # not used
     lo, hi = np.empty(width, np.int64), np.empty(width, np.int64)
     upper, lower = np.empty((2 * width + 2, 2), np.int64), np.empty((2 * width + 2, 2), np.int64)
     for b in range(n):
@@ -78,7 +77,7 @@ def _replay(boxes: Any, count: Any, out: Any) -> None:
             for i in range(w):
                 for j in range(d):
                     cells[i, j] &= heightmap[x + i, y + j] == z
-            place_box(heightmap, empty_map, x, y, w, d, h)
+            place_box(heightmap, None, x, y, w, d, h)
             _fill_hull(cells, lo, hi, upper, lower)
 
 

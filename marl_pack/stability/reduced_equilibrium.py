@@ -36,7 +36,7 @@ from marl_pack.stability.static_equilibrium import STRICT
 NO, YES, UNSURE = 0, 1, 2
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _overlap(a: Any, b: Any) -> tuple[int, int, int, int]:
     """Return the rectangle x0, y0, x1, y1 that two boxes share seen from above.
 
@@ -50,7 +50,7 @@ def _overlap(a: Any, b: Any) -> tuple[int, int, int, int]:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _touches(a: Any, b: Any) -> bool:
     """Return whether box ``a`` rests on box ``b``."""
     if a[2] != b[2] + b[5]:
@@ -59,7 +59,7 @@ def _touches(a: Any, b: Any) -> bool:
     return x0 < x1 and y0 < y1
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
     """Find where the ground pushes at a box: the vertices of the hull of its bearing cells.
 
@@ -82,7 +82,7 @@ def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
     return n_upper + n_lower
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing: Any) -> bool:
     """Mark the cells of a window that touch a box resting at ``z`` and bear.
 
@@ -139,7 +139,7 @@ def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[An
     return grounded, points, count
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tuple[Any, Any, int]:
     """Find the boxes that the new box ``n`` may disturb.
 
@@ -173,7 +173,7 @@ def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tu
     return queue[:size], row, forces
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _system(
     boxes: Any, loads: Any, grounded: Any, points: Any, count: Any, members: Any, row: Any,
     forces: int,

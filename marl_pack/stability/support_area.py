@@ -25,30 +25,6 @@ THRESHOLDS = {"paper": PAPER, "code": CODE}
 """The thresholds by name."""
 
 
-@njit(cache=True)
-def _stands(window: Any, z: int, share: Any, corners: Any) -> bool:
-    """Return whether a box that rests at ``z`` on ``window`` [w, d] meets one of the thresholds."""
-    w, d = window.shape
-    supported = (
-        int(window[0, 0] == z) + int(window[0, d - 1] == z)
-        + int(window[w - 1, 0] == z) + int(window[w - 1, d - 1] == z)
-    )  # fmt: skip
-    needed = 2.0
-    for k in range(share.size):
-        if supported >= corners[k]:
-            needed = min(needed, share[k])
-    spare = w * d - needed * (w * d)  # stands if fewer cells than this are missing
-    missing = 0
-    for x in range(w):
-        row = 0
-        for y in range(d):
-            row += window[x, y] != z
-        missing += row
-        if missing >= spare:
-            break
-    return bool(w * d - missing > needed * (w * d))
-
-
 @njit(cache=True, nogil=True)
 def _fill_masks(
     heightmap: Any, sides: Any, height: int, share: Any, corners: Any, out: Any
@@ -69,9 +45,29 @@ def _fill_masks(
             for i in range(cells):
                 if mask[i] == 0:
                     continue
-                z, x, y = top[i], i // depth, i % depth
-                window = heightmap[b, x : x + w, y : y + d]
-                mask[i] = z + h <= height and _stands(window, z, share, corners)
+                z = top[i]
+                mask[i] = 0
+                if z + h > height:
+                    continue
+                window = heightmap[b, i // depth : i // depth + w, i % depth : i % depth + d]
+                supported = (
+                    int(window[0, 0] == z) + int(window[0, d - 1] == z)
+                    + int(window[w - 1, 0] == z) + int(window[w - 1, d - 1] == z)
+                )  # fmt: skip
+                needed = 2.0
+                for k in range(share.size):
+                    if supported >= corners[k]:
+                        needed = min(needed, share[k])
+                spare = w * d - needed * (w * d)  # stands if fewer cells than this are missing
+                missing = 0
+                for x in range(w):
+                    row = 0
+                    for y in range(d):
+                        row += window[x, y] != z
+                    missing += row
+                    if missing >= spare:
+                        break
+                mask[i] = w * d - missing > needed * (w * d)
 
 
 def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
