@@ -27,10 +27,11 @@ The six orientations are the rows of :data:`marl_pack.bins.ORIENTATIONS`.
 **Reward.** After each placement both agents get ``alpha · v_item - beta · v_waste``, as shares of
 the bin's volume (Eq. 5-7); after each orientation both get 0.
 
-**End.** Both agents terminate together when the next item has no legal action (or there is none),
-and are truncated together after ``max_cycles`` items.
+**End.** Both agents terminate together when the next item has no legal action, there is no next
+item, or the bin holds ``max_items`` boxes. They are truncated together after ``max_cycles`` items.
 
 **Info.** For both agents ``utilization`` (share of the bin filled) and ``packed`` (boxes in it).
+``env.unwrapped.plan`` is the record of the boxes placed so far (:class:`marl_pack.plan.Plan`).
 
 Version history: v0, first release.
 """
@@ -234,7 +235,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         """Empty the bin and begin an episode.
 
         Args:
-            seed: begins the item stream anew from this seed. Without one the stream goes on to its
+            seed: begins the item stream again from this seed. Without one the stream goes on to its
                 next episode (from a random seed if none was ever given).
             options: ``{"items": …}`` plays that sequence once, whatever the stream: an array
                 [L, 3], or items with attributes.
