@@ -294,10 +294,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         choice, repaired = self._legal(agent, action)
         self._cumulative_rewards[agent] = 0.0
         self._clear_rewards()
-        if self._chosen is None:
-            self._chosen = choice
-        else:
+        if self._chosen is not None:
             self._place(self._chosen, choice)
+        elif self._masks[choice].any():
+            self._chosen = choice
+        else:  # only without mask_orientations: it ends the episode with nothing placed
+            self._place(choice, 0)
         self.agent_selection = self._acting
         self._accumulate_rewards()
         self.infos = {name: self._info(name) for name in self.agents}

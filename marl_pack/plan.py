@@ -250,13 +250,15 @@ class Plan:
             columns("centre_x", "centre_y"), table.get("id", ()), unit_mm,
         )  # fmt: skip
 
-    def to_json(self, path: Path) -> None:
+    def to_json(self, path: str | Path) -> None:
         """Write the plan as JSON: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
 
         Each box is an object with the keys :data:`BOX`.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
-        write_json(path, {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes})
+        write_json(
+            Path(path), {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes}
+        )
 
     @classmethod
     def from_json(cls, path: str | Path) -> Plan:
@@ -274,7 +276,7 @@ class Plan:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
-    def to_csv(self, path: Path) -> None:
+    def to_csv(self, path: str | Path) -> None:
         """Write the plan as CSV: a header line, then one line for each box, in order.
 
         The columns are :data:`COLUMNS`. Each line says the size of its bin and the unit
@@ -293,7 +295,7 @@ class Plan:
         writer.writerow(COLUMNS)
         rows = zip(self._rows(), sizes, strict=True)
         writer.writerows([*row, *size, unit] for row, size in rows)
-        write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+        write_atomically(Path(path), lambda file: file.write(text.getvalue().encode()))
 
     @classmethod
     def from_csv(cls, path: str | Path) -> Plan:

@@ -19,7 +19,7 @@ POLICIES = {"most_room": "max_feasible"}
 AGENT_KEYS = {"imitate": "teacher", "imitate_iterations": "teacher_iterations"}
 """Settings of an agent (:class:`marl_pack.config.Agent`)."""
 
-OPTIONS = {"size": "bin", "rule_parameters": "margin' or 'thresholds"}
+OPTIONS = {"size": "bin", "rule_parameters": "margin or thresholds"}
 """Keyword arguments that games took (:class:`marl_pack.game.spec.GameSpec`)."""
 
 

@@ -441,6 +441,24 @@ def test_a_first_item_without_a_place_is_refused_at_reset() -> None:
         env.reset(seed=0)
 
 
+@pytest.mark.parametrize("illegal", ["terminate", "repair"])
+def test_without_a_mask_of_orientations_one_without_a_cell_ends_the_episode(illegal: str) -> None:
+    # A bin of one column: an item 1 x 1 x 2 that lies has no place.
+    rows = [[1, 1, 2], [1, 1, 1]]
+    env = env_aec.env(bin_size=(1, 1, 3), items=rows, mask_orientations=False, illegal=illegal)
+    env.reset(seed=0)
+    assert mask_of(env, O).all()
+    env.step(5)
+    assert env.terminations == {O: True, P: True}
+    assert env.rewards == {O: 0, P: 0}
+    assert not mask_of(env, P).any()
+    assert len(env.unwrapped.plan) == 0
+    for _ in range(2):
+        env.step(None)
+    assert env.agents == []
+    api_test(env, num_cycles=20)
+
+
 # --- pickling and pictures ------------------------------------------------------------------------
 
 

@@ -94,7 +94,7 @@ def test_rows_that_are_no_boxes_are_refused() -> None:
 @pytest.mark.parametrize("plan", [*ALL, NOTHING, replace(SEVERAL, bins=np.zeros(3, np.int64))])
 def test_json_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
-    plan.to_json(path)
+    plan.to_json(str(path))
     again = Plan.from_json(path)
     assert again == plan
     assert again.sides.dtype == plan.sides.dtype
@@ -103,7 +103,7 @@ def test_json_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
 @pytest.mark.parametrize("plan", ALL)
 def test_csv_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
     path = tmp_path / "plan.csv"
-    plan.to_csv(path)
+    plan.to_csv(str(path))
     again = Plan.from_csv(path)
     assert again == plan
     assert again.sides.dtype == plan.sides.dtype
