@@ -14,7 +14,7 @@ FORBIDDEN = -1e9
 
 
 class ActorCritic(nn.Module):
-    """A network that turns one agent's planes and mask into logits and the state's value.
+    """A network that computes logits and the state's value from one agent's planes and mask.
 
     Args:
         agent: ``"orientation"`` scores six orientations, ``"placement"`` every cell;
@@ -41,7 +41,7 @@ class ActorCritic(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of its weights."""
+        """The device of the network's weights."""
         return self.cells.weight.device
 
     def forward(self, planes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,7 +53,7 @@ class ActorCritic(nn.Module):
         """
         legal = mask.bool()
         batch, _, width, depth = planes.shape
-        if self.agent != "orientation":  # where the item may go says most
+        if self.agent != "orientation":  # the legal cells are the most useful plane
             cells = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
             if self.agent == "both":
                 cells = cells * planes[:, 4:]  # in the orientation's turn the mask has no cells

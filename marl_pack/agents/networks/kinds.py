@@ -16,13 +16,13 @@ from marl_pack.game.moves import Floor
 from marl_pack.game.packing import Packing
 
 Choice = tuple[Tensor, ...]
-"""What was chosen so far in a turn of the game: (), (orientation,) or (orientation, cell), int64
+"""The choices so far in a turn of the game: (), (orientation,) or (orientation, cell), int64
 [G] each."""
 
 
 @dataclass(frozen=True)
 class AgentKind:
-    """How one kind of agent observes and acts.
+    """The record of how one kind of agent observes and acts.
 
     Args:
         name: its name in settings, checkpoints and scalars.
@@ -85,7 +85,7 @@ def observe(
     lookahead: Lookahead,
     orientation: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Return what an agent observes of G games; training, play and export all use this.
+    """Return what an agent observes of G games, in training, play and export alike.
 
     Args:
         kind: name in :data:`AGENT_KINDS`.
