@@ -145,10 +145,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     Attributes:
         utilization: share of the bin filled, in [0, 1].
-        plan: what is packed (:class:`marl_pack.plan.Plan`).
+        plan: the boxes placed so far (:class:`marl_pack.plan.Plan`).
 
     Raises:
-        ValueError: if an argument cannot be, naming what would be right.
+        ValueError: if an argument is impossible; says what would be right.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo reads it from the class

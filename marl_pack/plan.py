@@ -263,7 +263,7 @@ class Plan:
         """Read a plan that :meth:`to_json` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for a value that cannot be.
+            ValueError: if it is another kind of file, or for an impossible value.
         """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -300,7 +300,7 @@ class Plan:
         """Read a plan that :meth:`to_csv` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for a value that cannot be.
+            ValueError: if it is another kind of file, or for an impossible value.
         """
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             header, *lines = list(csv.reader(file)) or [[]]

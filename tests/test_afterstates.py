@@ -1,4 +1,4 @@
-"""The critic of afterstates: features, values of placements, learning, and who owns it."""
+"""The critic of afterstates: features, values of placements, learning, and its owner."""
 
 from collections import Counter
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Checkpoints: what they rebuild, and which files are refused."""
+"""Checkpoints rebuild their policies, and other files are refused."""
 
 from pathlib import Path
 

@@ -141,7 +141,7 @@ def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     (b"ppo:\n  gamma: 0.9\n  lam: 0.9\n  gamma: 0.8\n", "line 4: ppo.gamma is given twice"),
     (b"ppo:\n", "line 1: ppo is a section"),
     (b"placement:\n  network: 3\n", "line 2: placement.network is a section"),
-    (b"resume: runs/x\n", "line 1: --resume goes on the command line"),
+    (b"resume: runs/x\n", "line 1: --resume needs to be on the command line"),
 ])  # fmt: skip
 def test_a_broken_file_is_named_with_the_line(
     text: bytes, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

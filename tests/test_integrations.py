@@ -1,4 +1,4 @@
-"""What other people's trainers use: the network, and the compliance report of what they did."""
+"""The network and the compliance report that other trainers use."""
 
 import importlib.util
 import json

@@ -1,4 +1,4 @@
-"""Afterstates against the meaning of their fields, and bits against masks."""
+"""Afterstates equal the bins after each placement, and counts by bits equal those by masks."""
 
 from dataclasses import replace
 from itertools import permutations, product

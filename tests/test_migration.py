@@ -1,4 +1,4 @@
-"""Checkpoints of format 1 are read as those of format 2."""
+"""Checkpoints of format 1 are migrated to format 2."""
 
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def test_a_model_of_format_1_is_read_as_format_2(path: Path) -> None:
 
 @pytest.mark.parametrize("path", ORIGINALS[:1], ids=lambda path: path.stem)
 def test_the_export_of_a_migrated_model_loads_into_a_stock_ppo(path: Path, tmp_path: Path) -> None:
-    """With the optimiser's state, whose parameters are numbered without the removed critic."""
+    """The optimiser's parameters are numbered without those of the removed critic."""
     assert export([str(path), "--format", "rsl_rl", "--folder", str(tmp_path)]) == 0
     settings = configs.from_dict(checkpoints.read(path)["config"])
     settings.init = str(path)

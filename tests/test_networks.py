@@ -20,7 +20,7 @@ PAPER = {"heightmap", "item", "height", "mask"}
 
 
 def first_orientation(game: Packing, agent: str) -> Choice:
-    """Return what is chosen before the agent's turn: the first legal orientation, or nothing."""
+    """Return the choices before the agent's turn: the first legal orientation, or nothing."""
     return (game.orientation_mask.int().argmax(1),) if agent == "placement" else ()
 
 

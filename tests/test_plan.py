@@ -1,4 +1,4 @@
-"""Plans: what they refuse, what they say, and that files of them read back as they were."""
+"""Plans: refused values, their parts, and files that read back as they were written."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -245,7 +245,7 @@ def test_a_plan_of_a_game_holds_the_boxes_in_its_bin() -> None:
 
 
 class Labelled:
-    """A state of one bin that knows which items its boxes are."""
+    """A state of one bin whose boxes have labels."""
 
     size = BIN
     count = torch.tensor([2])

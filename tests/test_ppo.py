@@ -225,7 +225,7 @@ def test_a_run_with_a_frozen_network_resumes_without_the_old_file(tmp_path: Path
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
-    """Else the KL that the adaptive schedule sees is huge, and the learning rate collapses."""
+    """Otherwise the KL would be huge, and the adaptive learning rate would collapse."""
     config = tiny("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--ppo.desired_kl=0.02",
                   f"--joint={str(joint).lower()}")  # fmt: skip
     runner = make_runner(config, None)

@@ -1,4 +1,4 @@
-"""The judge: stacks whose fate is known, what collides with what, what is refused."""
+"""The judge: stacks with a known verdict, collisions, and refused stacks and options."""
 
 import json
 import re
@@ -227,7 +227,7 @@ def test_heavy_boxes_on_light_ones_stand() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_judge_agrees_with_the_exact_equilibrium_on_random_stacks(seed: int) -> None:
-    """The first stack of each bin that statics calls unstable, and the one before it."""
+    """The first stack of each bin that is not in equilibrium, and the one before it."""
     pile = random_stack(seed, "hull_1" if seed % 2 else "none")
     rng = np.random.default_rng(seed)
     bodies = replace(
@@ -414,7 +414,7 @@ def test_a_plan_becomes_a_stack_in_its_own_unit() -> None:
 def test_a_plan_of_several_bins_is_judged_bin_by_bin() -> None:
     plan = Plan.of_boxes(BIN, [FLAT, (0, 0, 0, 2, 2, 2)][:1])
     plan = replace(plan, bin_sizes=np.array([BIN, BIN]))
-    with pytest.raises(ValueError, match=r"2 bins: judge each, plan\.in_bin\(k\)"):
+    with pytest.raises(ValueError, match=r"2 bins: needs one, plan\.in_bin\(k\)"):
         Stack.of_plan(plan)
     assert [len(Stack.of_plan(plan.in_bin(k))) for k in (0, 1)] == [1, 0]
 

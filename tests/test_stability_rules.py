@@ -1,4 +1,4 @@
-"""Drawn cases that can be checked by hand, and errors at the door."""
+"""Small cases that can be checked by hand, and refused arguments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The command that trains: stopping, resuming, several processes, what it writes."""
+"""The command that trains: stopping, resuming, several processes and its files."""
 
 import csv
 import json
@@ -154,7 +154,7 @@ def test_a_resumed_run_may_be_longer_but_not_different(
 def test_weights_and_biases_get_the_settings_and_the_scalars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a stand-in for the package, which needs an account."""
+    """A fake module replaces the package, which needs a user's login."""
     from rsl_rl.utils import wandb_log_writer
 
     logged: dict[str, object] = {}
@@ -252,7 +252,7 @@ def test_a_run_begins_with_the_weights_of_another(
 
 
 def test_a_run_can_be_resumed_from_its_very_start(tmp_path: Path) -> None:
-    """A checkpoint is there before the first iteration; after resuming it has new settings."""
+    """The first checkpoint precedes the first iteration; resuming gives it new settings."""
     starts: list[int] = []
 
     class StoppedError(Exception):

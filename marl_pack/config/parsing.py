@@ -30,7 +30,7 @@ def make_parser() -> ArgumentParser:
     parser.add_argument("--config", action="config", help="YAML file of settings; may be repeated")
     parser.add_argument(
         "--resume", metavar="RUN", default=None,
-        help="go on with the run in this folder, exactly; only output.*, evaluation.* and "
+        help="continue the run in this folder exactly; only output.*, evaluation.* and "
         "ppo.max_iterations may be given beside it",
     )  # fmt: skip
     parser.add_class_arguments(Config, None)
@@ -85,7 +85,7 @@ def check_file(path: Path) -> None:
             if key in names:
                 raise ConfigError(f"{where}: {key} is given twice")
             if key == "resume":
-                raise ConfigError(f"{where}: --resume goes on the command line")
+                raise ConfigError(f"{where}: --resume needs to be on the command line")
             names.add(key)
             if isinstance(value, yaml.MappingNode):
                 check_section(value, f"{key}.")

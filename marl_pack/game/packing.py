@@ -91,7 +91,7 @@ class Packing:
         spec: options of the game; by default the usual ones.
         sides: shortest and longest side of generated items.
         auto_reset: begin a new episode in a game as soon as one ends there. Without it a game that
-            has ended stays as it is, its mask stays empty and what is played there is ignored.
+            has ended does not change, its mask stays empty and its actions are ignored.
         device: where all tensors live.
         backend: compiled loops or tensor code; by default the faster one on the device.
         seed: of the item streams.
@@ -335,7 +335,7 @@ class Packing:
         return Outcome(reward, done, filled, placed, self.volume)
 
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
-        """Raise ValueError if a choice in a game that goes on is not legal."""
+        """Raise ValueError if a choice in a game that has not ended is not legal."""
         legal = self.moves.allows(orientation, cell)
         if not self.spec.mask_orientations:  # an orientation without a cell may be chosen
             real = (orientation >= 0) & (orientation < len(ALL_ORIENTATIONS))

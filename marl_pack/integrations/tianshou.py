@@ -29,7 +29,7 @@ class Actor(ActionReprNet):
         self.network = network
 
     def forward(self, obs: Any, state: Any = None, info: Any = None) -> tuple[torch.Tensor, Any]:
-        """Return masked logits [B, n], and the state as it was."""
+        """Return masked logits [B, n], and the state unchanged."""
         return outputs(self.network, obs)[0], state
 
 
@@ -48,7 +48,7 @@ class Critic(nn.Module):
 class OwnTurns(MultiAgentOnPolicyAlgorithm):
     """The learners of several agents, each of which learns from its own turns only.
 
-    Tianshou takes every turn as a step of its own. Here an agent's reward is all that it got until
+    Tianshou treats every turn as a step. Here an agent's reward is the sum of its rewards until
     its next turn, and its next observation is that of its next turn.
     """
 

@@ -66,7 +66,7 @@ class Stream(Protocol):
         ...
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
-        """Return the state [N, …] where some episodes begin and the others go on.
+        """Return the state [N, …] in which some episodes begin and the others continue.
 
         Args:
             state: of the N episodes; it is not changed.

@@ -28,7 +28,7 @@ class Bodies:
         None  # kg/m³, drawn between (log-uniform); None: as packed
     )
     com_spread: float = 0.0  # centre of mass drawn up to so far off, in fractions of w, d, h
-    seed: int = 0  # of what is drawn
+    seed: int = 0  # of the drawn densities and centres
 
     def __post_init__(self) -> None:
         low, high = self.density or (DENSITY, DENSITY)
@@ -56,7 +56,7 @@ class Bodies:
 
         Args:
             plan: boxes in one bin.
-            episode: number of the plan, which with the seed decides what is drawn.
+            episode: number of the plan; with the seed it decides the drawn values.
 
         Raises:
             ValueError: naming the episode and the box, if the stack is impossible.

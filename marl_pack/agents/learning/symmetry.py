@@ -12,7 +12,7 @@ def mirror_rollout(ppo: PPO, agent: str) -> None:
     """Replace each sample of a rollout by its image under a random symmetry of the bin.
 
     Rewards and returns are as they were. The old log-probabilities, distributions and values become
-    those of what is now observed, so that the update begins from ratios of 1.
+    those of the mirrored observations, so that the update begins from ratios of 1.
 
     Args:
         ppo: a learner's, with a full storage.

@@ -1,4 +1,4 @@
-"""The kinds of agents: one record each in :data:`AGENT_KINDS`, and what each kind observes."""
+"""The kinds of agents: one record each in :data:`AGENT_KINDS`, and the observation of each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AgentKind:
             they are orientations.
         mask: its legal actions in a turn, bool [G, K].
         head: builds the network's head: features → logits [G, K].
-        extend: adds its actions int64 [G] to what was chosen before.
+        extend: adds its actions int64 [G] to the choices before.
     """
 
     name: str

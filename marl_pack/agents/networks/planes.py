@@ -81,7 +81,7 @@ class Plane:
 
     Args:
         name: its name in settings.
-        meaning: what it shows.
+        meaning: its meaning in a few words.
         observe: a turn → tensors of the observation, by name; planes may share a tensor.
         channels: number of input channels for A orientations.
         encode: the observation → input channels, float32 [G, …, W, D] each.
