@@ -1,4 +1,4 @@
-"""What is timed, and against what. Each module is a command: ``python -m benchmarks.masks``.
+"""Benchmarks of speed and of results; each module is a command: ``python -m benchmarks.masks``.
 
 Figures are CPU time on one thread, the best of several repetitions, and are meant as ratios within
 one run: machines differ, and so does one machine from minute to minute.

@@ -1,4 +1,4 @@
-"""Measure what each agent and each choice brings: ``python -m benchmarks.ablations``.
+"""Compare training with and without each agent and choice: ``python -m benchmarks.ablations``.
 
 Every config in ``configs/ablations`` is trained with three seeds for the same number of items. With
 ``--config`` and ``--changes`` it is one config, each time with the options of one change. Runs that
@@ -38,7 +38,7 @@ def train(name: str, options: list[str], seed: int, folder: Path) -> Path:
     if (run / "latest.pt").is_file():
         settings = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
         if settings != parse(options)[0].to_dict():
-            raise SystemExit(f"{run}: was trained with other settings; give another --folder")
+            raise SystemExit(f"{run}: was trained with other settings; needs another --folder")
         command += ["--resume", str(run)]
     else:
         command += options
@@ -47,11 +47,11 @@ def train(name: str, options: list[str], seed: int, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Train what is missing, then print the table."""
+    """Train the runs that are missing, then print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.ablations")
     options.add_argument("names", nargs="*", help="configs in configs/ablations (default: all)")
     options.add_argument("--folder", type=Path, default=Path("runs/ablations"))
-    options.add_argument("--config", type=Path, help="train this config, changed, in their place")
+    options.add_argument("--config", type=Path, help="train this config with --changes instead")
     options.add_argument("--changes", nargs="+", default=[], metavar="OPTIONS",
                          help='of marl_pack.train, as "--seed 1"; "" for no change')  # fmt: skip
     options.add_argument("--every", default="", metavar="OPTIONS", help="options of every run")

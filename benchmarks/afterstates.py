@@ -1,8 +1,8 @@
-"""What the agents add to their critic of afterstates: ``python -m benchmarks.afterstates RUN …``.
+"""Compare agents with their afterstate critic alone: ``python -m benchmarks.afterstates RUN …``.
 
-Plays the same generated sequences, of the items that each checkpoint was trained on, with its
-agents and greedily, each time the placement with the highest value, and prints the mean utilization
-of both and the difference episode by episode, with 95 % intervals.
+Plays the same generated sequences, of the items that each checkpoint was trained on, once with its
+agents and once greedily, always taking the placement with the highest value. Prints the mean
+utilization of both and the difference episode by episode, with 95 % intervals.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def greedy(critic: AfterstateCritic) -> Policy:
 
 
 def main() -> None:
-    """Print the table."""
+    """Play with each checkpoint and print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.afterstates")
     options.add_argument("checkpoints", nargs="+", help="that have a critic of afterstates")
     options.add_argument("--episodes", type=int, default=1000)

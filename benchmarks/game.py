@@ -1,7 +1,7 @@
-"""How fast is the game? ``python -m benchmarks.game``.
+"""Measure the speed of the game: ``python -m benchmarks.game``.
 
-Random feasible play with the masks of all six orientations at every step, choice included: N bins
-at once on every device, cost against the grid's size, and one bin through the PettingZoo view.
+Random feasible play with the masks of all six orientations at every step, choice included: N games
+at once on every device, cost against the grid's size, and one game through the PettingZoo view.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ play, 64 types, the feasibility mask at every step; measured side by side on one
 
 
 def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> float:
-    """Items placed per second of CPU time (of wall time on CUDA): the best of ``repeats``."""
+    """Return items placed per second of CPU time (on CUDA wall time): the best of ``repeats``."""
     on_cpu = game.device.type == "cpu"
     clock = time.process_time if on_cpu else time.perf_counter
     policy = make_policy("random", 0, game.device)
@@ -47,18 +47,18 @@ def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> f
 
 
 def batched() -> None:
-    """Steps per second against the number of bins."""
+    """Print steps per second against the number of games."""
     rows = []
     for device in devices():
         for n in (1, 64, 1024, 4096) if device == "cpu" else (1024, 4096, 16384, 65536):
             speed = steps_per_second(Packing(n, device=device))
             rows.append([f"marl_pack, N = {n:,}", device, f"{speed:,.0f}"])
-    rows += [[name, "cpu, told", f"{speed:,}"] for name, speed in OTHERS]
+    rows += [[name, "cpu, reported", f"{speed:,}"] for name, speed in OTHERS]
     show("steps a second, 10 × 10 × 10, 6 orientations", ["", "device", "steps/s"], rows)
 
 
 def scaling() -> None:
-    """Steps per second against the grid's size; the items grow with the bin."""
+    """Print steps per second against the grid's size; the items grow with the bin."""
     rows = []
     for side in (10, 20, 40, 80, 160):
         n = max(4, 1024 * 100 // side**2)
@@ -70,7 +70,7 @@ def scaling() -> None:
 
 
 def through_pettingzoo(seconds: float = 1.0, repeats: int = 5) -> None:
-    """Turns per CPU-second of one bin through the AEC view, in all its wrappers."""
+    """Print turns per CPU-second of one game through the AEC view, in all its wrappers."""
     env = env_aec.env()
     env.reset(seed=0)
     generator = np.random.default_rng(0)
@@ -79,11 +79,11 @@ def through_pettingzoo(seconds: float = 1.0, repeats: int = 5) -> None:
         start, turns = time.process_time(), 0
         while time.process_time() - start < seconds:
             for agent in env.agent_iter():
-                seen, _, terminated, truncated, _ = env.last()
+                observation, _, terminated, truncated, _ = env.last()
                 if terminated or truncated:
                     env.step(None)
                     continue
-                legal = np.flatnonzero(seen["action_mask"])
+                legal = np.flatnonzero(observation["action_mask"])
                 env.step(legal[generator.integers(len(legal))])
                 turns += 1
                 del agent
@@ -93,7 +93,7 @@ def through_pettingzoo(seconds: float = 1.0, repeats: int = 5) -> None:
 
 
 def main() -> None:
-    """All figures."""
+    """Print all figures of this benchmark."""
     torch.set_num_threads(1)
     batched()
     scaling()

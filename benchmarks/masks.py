@@ -69,7 +69,7 @@ def literal_algorithm_1(
 
 
 def against_the_literal_reading(states: int = 32) -> None:
-    """Print figure 1: one mask beside the literal reading."""
+    """Print figure 1: one mask, compared with the literal reading."""
     size, sides = LARGE
     game = in_play(states, LARGE, steps=12)
     items = random_items(states, sides)
@@ -110,7 +110,7 @@ def against_the_literal_reading(states: int = 32) -> None:
 
 
 def batched(n: int = 1024) -> None:
-    """Print figure 2: batched masks of every rule."""
+    """Print figure 2: the batched masks of every rule."""
     rows = []
     for device in devices():
         game = in_play(n, SMALL, device=device)
@@ -127,7 +127,7 @@ def batched(n: int = 1024) -> None:
 
 
 def scaling() -> None:
-    """Print figure 3: masks against the grid.
+    """Print figure 3: the cost of masks against the grid.
 
     The items grow with the bin, from its 5th to half of it.
     """
@@ -144,7 +144,7 @@ def scaling() -> None:
 
 
 def main() -> None:
-    """Print all three figures."""
+    """Print all three figures of this benchmark."""
     torch.set_num_threads(1)
     against_the_literal_reading()
     batched()

@@ -41,7 +41,7 @@ def spread(values: NDArray[np.float64]) -> str:
 
 
 def main() -> None:
-    """Play, and print the table."""
+    """Play with each plan and print the table."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.planning")
     options.add_argument("checkpoint", type=Path, help="trained on generated RS")
     options.add_argument("--plans", nargs="+", default=PLANS, metavar="rollouts=K,top=M,depth=D")
@@ -65,15 +65,15 @@ def main() -> None:
 
     def alone(policy: Policy) -> float:
         """Return the seconds of a decision for a single bin: the median over two episodes."""
-        taken = []
+        decisions = []
         for episode in range(3):
             bin_ = game(1, episode)
             while bin_.alive.any():
                 start = time.perf_counter()
                 choice = policy(bin_)
-                taken.append((episode, time.perf_counter() - start))
+                decisions.append((episode, time.perf_counter() - start))
                 bin_.place(*choice)
-        return float(np.median([seconds for episode, seconds in taken if episode]))
+        return float(np.median([seconds for episode, seconds in decisions if episode]))
 
     plain: NDArray[np.float64] | None = None
     table = []

@@ -1,7 +1,7 @@
 """Time the afterstates of all legal placements: ``python -m benchmarks.room``.
 
-Every legal placement of the visible items in bins that random play has begun to fill: in how many
-cells each box that may come could be placed afterwards, by sets of cells as bits (floors of up to
+The bins are partly filled by random play. For every legal placement of the visible items the cells
+are counted where each of the next boxes could be placed: by sets of cells as bits (floors of up to
 128 cells), by compiled masks, and by tensor code.
 """
 
@@ -39,7 +39,7 @@ def seconds(
 
 
 def main() -> None:
-    """Print the table."""
+    """Time the afterstates and print the table."""
     torch.set_num_threads(1)
     rows = []
     for n, size, sides in ((64, (10, 10, 10), (2, 5)), (8, (20, 20, 20), (4, 10))):
@@ -64,7 +64,7 @@ def main() -> None:
                  f"{masks / time:.2g}"]
             )  # fmt: skip
     show(
-        "what each placement leaves",
+        "afterstates of legal placements",
         ["bin", "by", "device", "µs a placement", "µs an item", "times compiled masks"],
         rows,
     )

@@ -66,7 +66,7 @@ def compare(
 
 
 def main() -> None:
-    """Print the table of every setting."""
+    """Print the table of each setting."""
     options = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__)
     options.add_argument("--large-bins", type=int, default=24, help="bins at 120 × 120 × 120")
     chosen = options.parse_args()

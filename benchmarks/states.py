@@ -1,4 +1,4 @@
-"""States to time masks on: what random play under a rule leaves behind."""
+"""Games in the middle of random play under a rule, to time masks on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def in_play(
     steps: int = 40,
     device: str = "cpu",
 ) -> Packing:
-    """N bins in the middle of their games, at all stages."""
+    """Return N games after some steps, at all stages of their episodes."""
     size, sides = place
     game = Packing(n, size, sides=sides, rule=rule, device=device, seed=1)
     player = make_policy(policy, 1, device)
@@ -31,6 +31,6 @@ def in_play(
 
 
 def random_items(n: int, sides: tuple[int, int], device: str = "cpu") -> torch.Tensor:
-    """Items int16 [N, 3]."""
+    """Return random items, int16 [N, 3]."""
     generator = torch.Generator().manual_seed(2)
     return torch.randint(sides[0], sides[1] + 1, (n, 3), generator=generator).short().to(device)

@@ -1,4 +1,4 @@
-"""Best CPU time of a function, and the table that benchmarks print."""
+"""Measure the best CPU time of a function, and print tables of results."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from rich.table import Table
 
 
 def best_time(work: Callable[[], object], repeats: int = 7, device: str = "cpu") -> float:
-    """Seconds that one call of ``work`` takes: the least of ``repeats`` (the rest is disturbance).
+    """Return the seconds of one call of ``work``: the least of ``repeats`` measurements.
 
-    CPU seconds of this process on the CPU; wall seconds, synchronised, on a CUDA device.
+    They are CPU seconds of this process on the CPU, and wall seconds, synchronised, on a CUDA
+    device. Disturbances only make a measurement longer.
     """
     clock = time.process_time if device == "cpu" else time.perf_counter
     calls, best = 1, float("inf")
@@ -39,7 +40,7 @@ def best_time(work: Callable[[], object], repeats: int = 7, device: str = "cpu")
 
 
 def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table."""
+    """Print a table of results."""
     table = Table(title=title)
     for k, column in enumerate(columns):
         table.add_column(column, justify="right" if k else "left")
@@ -49,5 +50,5 @@ def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> N
 
 
 def devices() -> list[str]:
-    """The CPU, and the CUDA device if there is one."""
+    """Return the CPU, and the CUDA device if there is one."""
     return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]

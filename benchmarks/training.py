@@ -1,9 +1,9 @@
-"""How fast does the trainer learn? ``python -m benchmarks.training``.
+"""Measure the speed of training: ``python -m benchmarks.training``.
 
-Items per second of whole PPO iterations, rollout and update (the best of several, as a machine's
-disturbances only slow), and where the time goes: environment
-with masks, networks (forward, backward, optimiser), rsl_rl's own machinery (storage, minibatches,
-advantages, loss), and the rest.
+Prints items per second of whole PPO iterations, rollout and update (the best of several, as
+disturbances only slow them), and the share of each part: the game with its masks, networks
+(forward, backward, optimiser), rsl_rl's own code (storage, minibatches, advantages, loss), and the
+rest.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ OTHERS = (
 
 
 class Split:
-    """Time spent in parts of a program, each without what it calls of another part.
+    """The time spent in each part of a program, without the calls to other parts.
 
     Args:
-        clock: seconds.
+        clock: returns seconds.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -46,14 +46,14 @@ class Split:
         self.part, self.since = "rest", clock()
 
     def enter(self, part: str) -> str:
-        """Count from now on for ``part``; returns the one before."""
+        """Count the time from now on for ``part``, and return the part before."""
         now = self.clock()
         self.seconds[self.part] += now - self.since
         before, self.part, self.since = self.part, part, now
         return before
 
     def watch(self, owner: Any, name: str, part: str) -> None:
-        """Count what the method ``owner.name`` does for ``part``."""
+        """Count the time in the method ``owner.name`` for ``part``."""
         method = getattr(owner, name)
 
         def watched(*args: Any, **named: Any) -> Any:
@@ -67,7 +67,7 @@ class Split:
 
 
 def watched(runner: Runner, split: Split) -> None:
-    """Count the parts of a runner's iterations."""
+    """Count the time in each part of a runner's iterations."""
     for name in ("step", "orient", "get_observations"):
         split.watch(runner.env, name, "game")
     for ppo in runner.alg.learners.values():
@@ -84,7 +84,7 @@ def watched(runner: Runner, split: Split) -> None:
 def measure(
     config_name: str, device: str, bins: int, seconds: float
 ) -> tuple[float, dict[str, float]]:
-    """Items per second (CPU seconds; wall seconds on CUDA) and the share of each part."""
+    """Return items per second (of CPU time; on CUDA wall time) and the share of each part."""
     config, _ = parse([
         f"--config={CONFIGS / config_name}.yaml", f"--ppo.num_envs={bins}", f"--device={device}",
         "--evaluation.every=0",
@@ -106,7 +106,7 @@ def measure(
         done += 1
         runner.train(done)
         best = max(best, items / (clock() - begun))
-    # The split is taken apart, as taking it costs (on CUDA it waits at every call).
+    # The shares are measured separately, as measuring costs time (on CUDA it waits at every call).
     split = Split(clock)
     watched(runner, split)
     backward, clip = torch.Tensor.backward, torch.nn.utils.clip_grad_norm_
@@ -125,7 +125,7 @@ def measure(
 
 
 def main() -> None:
-    """The table."""
+    """Measure training and print the table."""
     torch.set_num_threads(1)
     rows = []
     for device in devices():
@@ -136,7 +136,7 @@ def main() -> None:
                     [f"{config}, N = {bins:,}", device, f"{rate:,.0f}"]
                     + [f"{100 * shares[part]:.1f} %" for part in PARTS]
                 )
-    rows += [[name, "cpu, told", rate, "", "", "", ""] for name, rate in OTHERS]
+    rows += [[name, "cpu, reported", rate, "", "", "", ""] for name, rate in OTHERS]
     columns = ["", "device", "items/s", *PARTS]
     show("training, 10 × 10 × 10, RS, one core", columns, rows)
 

@@ -1,4 +1,4 @@
-"""Draw utilization against the spread of item volumes: the paper's figure, on RS test sequences.
+"""Draw utilization against the spread of item volumes, as the paper's figure does.
 
 ``python -m benchmarks.volume_spread CHECKPOINT --items rs.npz`` plays every sequence, groups the
 episodes by the standard deviation of the volumes of their sequence's items and draws the mean
@@ -50,7 +50,7 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
 
 
 def utilization(policy: str, stream: Stream, size: Size, episodes: int) -> NDArray[np.float64]:
-    """Return the utilization of each episode [E]."""
+    """Return the utilization of each episode of a policy, [E]."""
     chosen = Loader().policy(policy)
 
     def game(n: int, first: int) -> Packing:

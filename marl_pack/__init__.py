@@ -1,6 +1,6 @@
 """Learning to pack boxes online, safely.
 
-The game for N bins at once is :class:`marl_pack.game.packing.Packing`; its PettingZoo view is
+The rules of G games at once are in :class:`marl_pack.game.packing.Packing`; its PettingZoo view is
 :mod:`marl_pack.env_aec`; the stability rules are in :mod:`marl_pack.stability`.
 """
 

@@ -1,7 +1,7 @@
-"""The choice between two codes that give the same results: compiled loops, and tensor code.
+"""The choice between two implementations with equal results: compiled loops, and tensor code.
 
 A backend is chosen once, where bins are made (:func:`marl_pack.bins.empty`), from their device.
-Everything that is computed of these bins asks it which of two functions to call.
+Every operation on these bins asks it which of two functions to call.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ F = TypeVar("F")
 
 
 class Backend(Enum):
-    """Which code computes masks, placements, items and afterstates."""
+    """The implementation that computes masks, placements, items and afterstates."""
 
     COMPILED = "compiled"
     """Loops compiled by Numba; for tensors on the CPU."""
@@ -23,7 +23,7 @@ class Backend(Enum):
     """Batched PyTorch operations; for tensors on any device."""
 
     def pick(self, *, compiled: F, tensor: F) -> F:
-        """Return the function of this backend: the one switch between the two codes."""
+        """Return the function of this backend; this is the only switch between the two."""
         return compiled if self is Backend.COMPILED else tensor
 
 

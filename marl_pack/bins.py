@@ -1,4 +1,4 @@
-"""State of N bins: the boxes placed in them, and the maps derived from these boxes.
+"""The state of N bins: the boxes placed in them, and the maps derived from these boxes.
 
 Lengths are whole cells. ``x`` runs along W, ``y`` along D, ``z`` upwards. Shapes use the
 letters N (bins), W, D, H (a bin's sides), M (boxes a bin can hold) and A (orientations of an
@@ -56,10 +56,10 @@ ROW_PER_BOX = {"row_per_box": True}
 
 @dataclass(frozen=True)
 class Bins:
-    """N bins of one size.
+    """The state of N bins of one size.
 
     The table of boxes (``boxes``, ``loads``, ``labels`` and ``count``) is the truth; ``heightmap``,
-    ``empty_map`` and ``filled`` are derived from it and kept beside it for speed. The tensors are
+    ``empty_map`` and ``filled`` are derived from it and stored beside it for speed. The tensors are
     written in place by :func:`place` and :func:`clear`. Rows of the table past ``count`` are void.
     """
 
@@ -74,11 +74,11 @@ class Bins:
     count: Tensor  # int64 [N]             boxes placed
     filled: Tensor  # int64 [N]            cells filled by boxes
     height: int  # H
-    backend: Backend  # which code computes placements, masks and afterstates
+    backend: Backend  # computes placements, masks and afterstates
 
     @property
     def size(self) -> Size:
-        """The sides (W, D, H)."""
+        """The sides of each bin (W, D, H)."""
         return self.heightmap.shape[1], self.heightmap.shape[2], self.height
 
     @property
@@ -101,7 +101,7 @@ class Bins:
         return replace(moved, backend=default_backend(device))
 
     def clone(self) -> Bins:
-        """Return an independent copy."""
+        """Return an independent copy of the bins."""
         return self.map(Tensor.clone)
 
     def for_boxes(self, most: int) -> Bins:
@@ -136,14 +136,14 @@ def empty(
     device: torch.device | str = "cpu",
     backend: Backend | None = None,
 ) -> Bins:
-    """Return N empty bins.
+    """Return N empty bins of one size.
 
     Args:
         n: number of bins.
         size: (W, D, H) in cells.
         max_boxes: M, the most boxes a bin may ever hold; the bin's volume in cells by default.
         device: where the tensors live.
-        backend: which code computes what depends on the bins; the device's default if None.
+        backend: computes what depends on the bins; the device's default if None.
 
     Raises:
         ValueError: if the size is impossible.
@@ -183,7 +183,7 @@ def check_device(device: torch.device | str) -> torch.device:
     """Return ``device`` as a ``torch.device``.
 
     Raises:
-        ValueError: unless it is the CPU or a CUDA device that is there.
+        ValueError: unless it is the CPU or a CUDA device that exists.
     """
     try:
         checked = torch.device(device)
@@ -230,7 +230,7 @@ def place(
 
 
 def _refuse(bins: Bins, full: bool) -> None:
-    """Raise the error of a placement that is impossible."""
+    """Raise the error of an impossible placement."""
     if full:
         most = bins.boxes.shape[1]
         raise ValueError(f"a bin that can hold {most} boxes is full: see max_boxes")
@@ -245,7 +245,7 @@ NO_LABELS = np.empty(0, np.int64), np.empty(0, np.int64)
 
 @njit(cache=True, nogil=True)
 def _obstacle(most: int, shape: tuple[int, int], count: Any, sides: Any, corners: Any) -> int:
-    """Return what makes a placement impossible: FULL, OUTSIDE or 0 for nothing."""
+    """Return why a placement is impossible: FULL, OUTSIDE or 0 if it is possible."""
     width, depth = shape
     obstacle = 0
     for b in range(count.size):
@@ -265,7 +265,7 @@ def _place_each(
     sides: Any, corners: Any, weights: Any, com: Any, ids: Any, orientations: Any,
     resting_height: Any, waste: Any, volume: Any,
 ) -> None:  # fmt: skip
-    """Place one box in each bin; optional arguments without entries have their defaults."""
+    """Place one box in each bin; empty arrays stand for the defaults of optional arguments."""
     for b in range(heightmap.shape[0]):
         w, d, h = sides[b, 0], sides[b, 1], sides[b, 2]
         x, y = corners[b, 0], corners[b, 1]

@@ -68,10 +68,10 @@ RENDER_MODES = ["human", "rgb_array", "ansi"]
 
 
 def env(*, illegal_reward: float = -1.0, **kwargs: Any) -> AECEnv:
-    """The environment in PettingZoo's usual wrappers.
+    """Return the environment in PettingZoo's usual wrappers.
 
     Args:
-        illegal_reward: what the agent gets that ends the game by an illegal action (only with
+        illegal_reward: reward of the agent that ends the game by an illegal action (only with
             ``illegal="terminate"``).
         **kwargs: of :class:`raw_env`.
     """
@@ -83,14 +83,14 @@ def env(*, illegal_reward: float = -1.0, **kwargs: Any) -> AECEnv:
 
 
 def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
-    """The environment in PettingZoo's parallel API.
+    """Return the environment in PettingZoo's parallel API.
 
     By default one step is one turn: all agents may send actions, only that of the acting agent
     (``infos[agent]["active_agent"]``) is played, and every mask shown is exact.
 
     With ``simultaneous=True`` one step is one item: both agents act on the same observation, so the
-    placement agent chooses before it can know the orientation. Its mask would be stale, about a
-    third of the placements it allowed would be illegal; here it is all 0 instead, and an illegal
+    placement agent chooses before the orientation is known. Its mask would be stale: about a
+    third of the placements that it allowed would be illegal. So it is all 0, and an illegal
     action is played as the nearest legal one. It is for code that needs every agent to act in every
     step, and needs ``illegal="repair"``.
 
@@ -110,14 +110,14 @@ class Turns(turn_based_aec_to_parallel_wrapper):
     """PettingZoo's turn-by-turn view; every info says whose turn it is, after a reset as well."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode."""
-        return self._tell(*super().reset(seed=seed, options=options))
+        """Begin an episode, with the acting agent in every info."""
+        return self._name_active(*super().reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """Play the action of the agent whose turn it is."""
-        return self._tell(*super().step(actions))
+        """Play the acting agent's action; name the next one in every info."""
+        return self._name_active(*super().step(actions))
 
-    def _tell(self, *returned: Any) -> Any:
+    def _name_active(self, *returned: Any) -> Any:
         for info in returned[-1].values():
             info["active_agent"] = self.aec_env.agent_selection
         return returned
@@ -145,10 +145,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     Attributes:
         utilization: share of the bin filled, in [0, 1].
-        plan: what is packed (:class:`marl_pack.plan.Plan`).
+        plan: the boxes placed so far (:class:`marl_pack.plan.Plan`).
 
     Raises:
-        ValueError: if an argument cannot be, naming what would be right.
+        ValueError: if an argument is impossible; says what would be right.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo reads it from the class
@@ -218,15 +218,15 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     @property
     def plan(self) -> Plan:
-        """What is packed: the boxes placed so far in this episode, in their order."""
+        """The boxes placed so far in this episode, in their order."""
         return self._game.plans()[0]
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The agent's observation space, the same object at each call."""
+        """Return the agent's observation space, the same object at each call."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The agent's action space, the same object at each call."""
+        """Return the agent's action space, the same object at each call."""
         return self.action_spaces[agent]
 
     # --- the game ---------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
                 [L, 3], or items with attributes.
 
         Raises:
-            ValueError: for items that cannot be, or if no episode has a legal first item.
+            ValueError: for impossible items, or if no episode has a legal first item.
         """
         unknown = set(options or {}) - {"items"}
         if unknown:
@@ -310,7 +310,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     def _place(self, orientation: int, cell: int) -> None:
         self._orientation_played[0], self._cell_played[0] = orientation, cell
-        outcome = self._game.place(  # step has looked whether it is legal
+        outcome = self._game.place(  # step has checked that it is legal
             torch.from_numpy(self._orientation_played),
             torch.from_numpy(self._cell_played),
             check=False,
@@ -340,7 +340,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             return int(legal[np.abs(legal - int(action)).argmin()]), True
         return self._game.floor.nearest(int(action), legal), True
 
-    # --- what is seen -----------------------------------------------------------------------------
+    # --- observations -----------------------------------------------------------------------------
 
     def _read_game(self) -> None:
         """Read this cycle's numbers from the game."""
@@ -357,22 +357,22 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         """The agent whose turn it is: the placement agent once an orientation is chosen."""
         return AGENTS[self._chosen is not None]
 
-    def _sides(self, turned: bool) -> NDArray[np.int16]:
+    def _sides(self, oriented: bool) -> NDArray[np.int16]:
         """Return the item's sides: its own, or along x, y, z once an orientation is chosen."""
-        if turned and self._chosen is not None:
+        if oriented and self._chosen is not None:
             return self._item[list(ORIENTATIONS[self._chosen])]
         return self._item
 
-    def _planes(self, turned: bool, whose_turn: bool) -> NDArray[np.float32]:
+    def _planes(self, oriented: bool, whose_turn: bool) -> NDArray[np.float32]:
         planes = np.empty((4 + whose_turn, *self._heights.shape), np.float32)
         planes[0] = self._heights
-        planes[1:4] = (self._sides(turned) / np.float32(self._unit))[:, None, None]
+        planes[1:4] = (self._sides(oriented) / np.float32(self._unit))[:, None, None]
         if whose_turn:
             planes[4] = self._chosen is not None
         return planes
 
     def action_mask(self, agent: str) -> NDArray[np.int8]:
-        """Return the agent's legal actions; none when it is not its turn."""
+        """Return the agent's mask of legal actions, all 0 when it is not its turn."""
         mask = np.zeros(self.action_spaces[agent].n, np.int8)
         if agent == self._acting:
             legal = self._orientation_mask
@@ -391,7 +391,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         return info
 
     def observe(self, agent: str) -> Any:
-        """Return what the agent observes now, whoever's turn it is, and after the end too."""
+        """Return what the agent observes now, in either agent's turn and after the end."""
         planes = self._planes(agent == PLACEMENT, self.pad_actions)
         if self.mask_in == "info":
             return planes
@@ -399,12 +399,12 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
 
     def state(self) -> NDArray[np.float32]:
         """Return float32 [5, W, D]: heightmap, the item as it lies, and whose turn it is (0, 1)."""
-        return self._planes(turned=True, whose_turn=True)
+        return self._planes(oriented=True, whose_turn=True)
 
-    # --- what a person sees -----------------------------------------------------------------------
+    # --- rendering --------------------------------------------------------------------------------
 
     def render(self) -> NDArray[np.uint8] | str | None:
-        """Show the bin, the item to come and where it may go.
+        """Show the bin, the item to come and the cells where it may be placed.
 
         Returns:
             uint8 [rows, columns, 3] for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
@@ -434,7 +434,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
     def _text(self) -> str:
         from marl_pack.render.turn import turn_text
 
-        game, sides = self._game, self._sides(turned=True).tolist()
+        game, sides = self._game, self._sides(oriented=True).tolist()
         return turn_text(self._title(), sides, game.bins.heightmap.numpy()[0], game.size[2])
 
     def _picture(self) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Play policies on item sequences and print what they reach.
+"""Play policies on item sequences and print a table of their results.
 
 ``python -m marl_pack.evaluate --policy dblf --items rs --episodes 1000`` prints a table: mean
 utilization with its 95 % interval, its standard deviation, items packed, decisions a second, and
@@ -35,7 +35,7 @@ EPISODES = 1000  # of a generated stream, unless --episodes is given
 
 
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
-    """Print the table, a row for each policy."""
+    """Print the results as a table, a row for each policy."""
     table = Table(title=title, box=box.SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("policy", overflow="fold")
     physics = any("falls" in row for row in rows.values())
@@ -85,28 +85,28 @@ def parser() -> argparse.ArgumentParser:
 
 
 def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bodies | None]:
-    """Return the number of episodes, and the bodies that physics is to judge, if it is.
+    """Check the options; return the number of episodes, and the bodies if physics is asked for.
 
     Raises:
-        ValueError: if an option cannot be, naming what would be right.
+        ValueError: if an option is impossible; says what would be right.
     """
     if arguments.save_stacks and len(setup.policies) > 1:
-        raise ValueError("--save-stacks goes with one policy: it keeps one stack an episode")
+        raise ValueError("--save-stacks: needs a single policy, as it stores one stack an episode")
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
             check_writable(path)
     bodies = chosen_bodies(arguments) if arguments.physics else None
     if bodies is not None:
-        load_sapien()  # says what to install before anything is played
+        load_sapien()  # if it is not installed, its error comes before the games
     elif any(getattr(arguments, key) is not None for key in BODY_OPTIONS):
         raise ValueError("--cell, --density and --com-spread go with --physics")
     if arguments.processes < 1:
         raise ValueError(f"--processes {arguments.processes}: needs 1 or more")
-    episodes, known = arguments.episodes, setup.stream.episodes
+    episodes, available = arguments.episodes, setup.stream.episodes
     if episodes is None:
-        episodes = known or EPISODES
-    if episodes < 1 or (known and episodes > known):
-        most = f" … {known}, the sequences of the file" if known else " or more"
+        episodes = available or EPISODES
+    if episodes < 1 or (available and episodes > available):
+        most = f" … {available}, the sequences of the file" if available else " or more"
         raise ValueError(f"--episodes {episodes}: needs 1{most}")
     return episodes, bodies
 
@@ -146,10 +146,10 @@ def evaluate_policy(
 
 
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
-    """Play what the options ask for; return a row of figures for each policy.
+    """Play the policies that the options choose; return a row of figures for each.
 
     Raises:
-        ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
     setup = choose(arguments, console)
     episodes, bodies = check_options(arguments, setup)
@@ -179,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(max(1, chosen.threads))
     try:
         run(chosen, Console())
-    except SimulationError as error:  # a process that judged has died
+    except SimulationError as error:  # a process of the judge has died
         options.exit(1, f"{options.prog}: {error}\n")
     except KeyboardInterrupt:
         options.exit(130, f"{options.prog}: interrupted\n")

@@ -34,7 +34,7 @@ OPSET = 18
 
 
 class Exported(nn.Module):
-    """An actor with plain tensors in and out.
+    """An actor whose inputs and outputs are plain tensors.
 
     Args:
         actor: the agent's.
@@ -56,7 +56,7 @@ class Exported(nn.Module):
 
 
 def example(agent: str, planes: Sequence[str]) -> dict[str, Tensor]:
-    """Return an observation of an agent in two games, whole numbers as int64."""
+    """Return an example of an agent's observation in two games, whole numbers as int64."""
     game = Packing(2, (7, 6, 8), sides=(2, 4))
     kind = AGENT_KINDS[agent]
     before = (game.orientation_mask.int().argmax(1),) if kind.orientations == 1 else ()
@@ -87,7 +87,7 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
     observation = example(agent, actor.cnns.planes)
     names = list(observation)
     batch, width, depth = (torch.export.Dim(name, min=1) for name in ("batch", "width", "depth"))
-    # The shape of a tensor says what is free in it, see marl_pack.agents.networks.planes.
+    # Which dimensions are free follows from their number (marl_pack.agents.networks.kinds.observe).
     free: dict[int, dict[int, object]] = {
         2: {0: batch}, 3: {0: batch, 1: width, 2: depth}, 4: {0: batch, 2: width, 3: depth},
     }  # fmt: skip
@@ -106,9 +106,9 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
 
 
 def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
-    """Write the critic of afterstates: ``features`` float32 [K, F] → ``value`` float32 [K].
+    """Write the critic of afterstates as ONNX: ``features`` [K, F] → ``value`` [K], both float32.
 
-    The value of a placement is its reward plus this value of the features of what it leaves
+    The value of a placement is its reward plus the critic's value of its afterstate's features
     (:func:`marl_pack.agents.afterstates.features.features`).
     """
     with warnings.catch_warnings():
@@ -128,19 +128,19 @@ def _write(program: torch.onnx.ONNXProgram | None, path: Path) -> None:
 
 
 def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -> str:
-    """Write one agent of a checkpoint; return what is printed about it.
+    """Write one agent of a checkpoint; return a line that reports it.
 
     Args:
         agent: its record.
         name: of the agent.
-        folder: where to.
+        folder: to write to.
         form: ``onnx`` or ``rsl_rl``.
     """
     if "network" not in agent:
         return f"{name}: played by {agent['name']}, no network to export"
     if form == "rsl_rl":
         if "critic_state_dict" not in agent:
-            return f"{name}: was frozen, has no critic that rsl_rl could load"
+            return f"{name}: frozen, so it has no critic that rsl_rl could load"
         path = folder / f"{name}.pt"
         checkpoints.write(path, {k: v for k, v in agent.items() if k != "teacher"})
         return f"{path}: for rsl_rl's PPO.load"
@@ -153,7 +153,7 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
     """Write every agent of a checkpoint, and its critic of afterstates.
 
     Raises:
-        ValueError, OSError: if the checkpoint cannot be read or a file not written.
+        ValueError, OSError: if the checkpoint cannot be read or a file cannot be written.
     """
     path = checkpoints.resolve(source)
     checkpoint = checkpoints.read(path)
@@ -172,7 +172,7 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command ``python -m marl_pack.export``."""
+    """Run the command ``python -m marl_pack.export``; return its exit status."""
     options = argparse.ArgumentParser(
         prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0]
     )
@@ -181,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--format", choices=["onnx", "rsl_rl"], default="onnx",
         help="ONNX (default), or the state that a stock rsl_rl PPO loads",
     )  # fmt: skip
-    options.add_argument("--folder", type=Path, help="where to (default: beside the checkpoint)")
+    options.add_argument("--folder", type=Path, help="to write to (default: beside the checkpoint)")
     chosen = options.parse_args(arguments)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:

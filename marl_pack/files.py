@@ -11,18 +11,18 @@ from typing import Any
 
 
 def check_writable(path: Path) -> None:
-    """Raise ValueError if a file cannot be written there."""
+    """Raise ValueError if no file can be written at ``path``."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
     if not os.access(path.parent, os.W_OK):
         raise ValueError(f"{path}: the folder {path.parent} may not be written to")
     if path.is_dir():
-        raise ValueError(f"{path}: is a folder; name a file")
+        raise ValueError(f"{path}: is a folder; needs the name of a file")
 
 
 @contextmanager
 def moved_into_place(path: Path) -> Iterator[Path]:
-    """Give a path with the same ending to write a file to; move the file into place at the end."""
+    """Yield a temporary path with the same ending; move its file into place at the end."""
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         yield part

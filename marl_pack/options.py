@@ -1,7 +1,7 @@
-"""What commands that play games take: who plays, and which game.
+"""Options of the commands that play games: who plays, and which game.
 
-Every option of the game that is not given is that of the first checkpoint among the players, else
-RS in a bin of 10 × 10 × 10 under ``hull_alpha``.
+An option of the game that is not given comes from the first checkpoint among the players. Without
+one the game is RS in a bin of 10 × 10 × 10 under ``hull_alpha``.
 """
 
 from __future__ import annotations
@@ -52,9 +52,10 @@ class Setup:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The options with those of the game filled in, for a report."""
-        given = {k: v for k, v in vars(self.arguments).items() if k not in ("json", "save_stacks")}
-        return given | self.spec.to_dict() | {"items": self.items, "sides": self.sides}
+        """All options, those of the game filled in, for a report."""
+        paths = "json", "save_stacks"
+        options = {key: value for key, value in vars(self.arguments).items() if key not in paths}
+        return options | self.spec.to_dict() | {"items": self.items, "sides": self.sides}
 
     def __str__(self) -> str:
         text = self.items
@@ -100,10 +101,10 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
 
     Args:
         arguments: the options.
-        console: where it is printed what checkpoints were trained on.
+        console: shows the game that each checkpoint was trained on.
 
     Raises:
-        ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
     check_device(arguments.device)
     if arguments.seed < 0:
@@ -124,16 +125,16 @@ def choose_game(
         arguments: the options; None where one was not given.
         learned: the game that the policies were trained on, empty if there is none.
     """
-    given = given_options(arguments)
-    if "rule" in given:  # these belong to the rule
+    chosen = given_options(arguments)
+    if "rule" in chosen:  # these belong to the rule
         learned = learned | {"margin": None, "thresholds": None}
     items = str(arguments.items or learned.get("items", "rs"))
     low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
-    size = given.get("bin")
+    size = chosen.get("bin")
     if size is None and (arguments.items is None or items in GENERATED):
         size = learned.get("bin")
     stream, bin_size = choose_stream(items, tuple(size) if size else None, (low, high))
-    spec = GameSpec.of(learned | given | {"bin": bin_size})
+    spec = GameSpec.of(learned | chosen | {"bin": bin_size})
     return stream, items, (low, high), spec
 
 
@@ -146,7 +147,7 @@ def choose_policies(
     :class:`marl_pack.config.Game`), empty if there is none.
 
     Raises:
-        ValueError, FileNotFoundError: if there is none of that name.
+        ValueError, FileNotFoundError: if there is no policy of such a name.
     """
     pair = arguments.orientation, arguments.placement
     if (pair[0] is None) != (pair[1] is None):
@@ -154,15 +155,15 @@ def choose_policies(
     names = arguments.policy or ([] if pair[0] else ["dblf"])
     sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
     if arguments.symmetric and all(name in ORIENTATION_AGENTS for name in sources):
-        raise ValueError("--symmetric goes with a run's folder or checkpoint")
+        raise ValueError("--symmetric: needs a run's folder or checkpoint")
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
     from marl_pack.agents.loading import Loader, trained_on
 
-    how = arguments.device, arguments.seed, arguments.symmetric
-    policies = {name: Loader(*how).policy(name) for name in names}
+    settings = arguments.device, arguments.seed, arguments.symmetric
+    policies = {name: Loader(*settings).policy(name) for name in names}
     if pair[0] is not None:
-        loader = Loader(*how)
+        loader = Loader(*settings)
         policies[f"{pair[0]} + {pair[1]}"] = in_turns(
             loader.orientation_agent(pair[0]), loader.placement_agent(pair[1])
         )
@@ -178,9 +179,9 @@ def choose_policies(
 def with_search(
     policies: dict[str, Policy], arguments: argparse.Namespace, stream: Stream, size: Size
 ) -> dict[str, Policy]:
-    """Return the learned policies searching as ``--plan`` says; heuristics stay as they are.
+    """Return the policies, the learned ones with the search of ``--plan``; heuristics unchanged.
 
-    What they imagine to come is what they were trained on; if that was a file, the rows of
+    They imagine items of the stream that they were trained on; if that was a file, rows of
     ``stream``.
 
     Raises:
@@ -192,11 +193,11 @@ def with_search(
 
     settings = SearchSettings.parse(arguments.plan)
     if all(name in POLICIES for name in policies) or arguments.orientation is not None:
-        raise ValueError("--plan goes with --policy and a run's folder or checkpoint")
-    searching: dict[str, Policy] = {}
+        raise ValueError("--plan: needs --policy with a run's folder or checkpoint")
+    policies_with_search: dict[str, Policy] = {}
     for name, policy in policies.items():
         if name in POLICIES:
-            searching[name] = policy
+            policies_with_search[name] = policy
             continue
         checkpoint = checkpoints.read(name, arguments.device)
         game = checkpoint["config"]["game"]
@@ -205,8 +206,8 @@ def with_search(
             try:
                 learned = make_stream(game["items"], size, tuple(game["sides"]))
             except ValueError as error:
-                raise ValueError(f"--plan: what the agents were trained on: {error}") from None
+                raise ValueError(f"--plan: items of the agents' training: {error}") from None
         futures = independent(learned).to(arguments.device)
         loader = Loader(arguments.device, arguments.seed, arguments.symmetric)
-        searching[f"{name}, {settings}"] = loader.planner(checkpoint, settings, futures)
-    return searching
+        policies_with_search[f"{name}, {settings}"] = loader.planner(checkpoint, settings, futures)
+    return policies_with_search

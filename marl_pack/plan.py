@@ -1,8 +1,8 @@
 """Plans: boxes as they were placed, in order, in one bin or several.
 
-A plan is what a game, a benchmark or a robot hands on once boxes have been placed. It does not
-change. It reads and writes JSON and CSV, which are meant for other programs; archives of many plans
-are in :mod:`marl_pack.plan_archive`. Shapes use the letters B (bins) and n (boxes).
+A plan is the result of a game, or of any other program that places boxes. It is immutable. It reads
+and writes JSON and CSV, which are meant for other programs; archives of many plans are in
+:mod:`marl_pack.plan_archive`. Shapes use the letters B (bins) and n (boxes).
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ COLUMNS = (*BOX, "bin_w", "bin_d", "bin_h", UNIT)
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """n boxes in order of placement, in B bins.
+    """The plan of n boxes in order of placement, in B bins.
 
     Lengths are in units of ``unit_mm`` millimetres. They are int64 if all lengths are whole
     numbers given as integers, else float64. Arrays are read-only copies of the arguments.
 
     Raises:
-        ValueError: for a shape or value that cannot be, naming the field and the box.
+        ValueError: for an impossible shape or value, naming the field and the box.
     """
 
     bin_sizes: Array  # [B, 3]        sides W, D, H of each bin
@@ -80,7 +80,7 @@ class Plan:
         self._check_values()
 
     def _check_values(self) -> None:
-        """Refuse values that cannot be, naming the first box for which one is wrong."""
+        """Refuse impossible values, naming the first box that has one."""
         unit = self.unit_mm
         if unit is not None and not (np.isfinite(unit) and unit > 0):
             raise ValueError(f"unit_mm = {unit}: needs a positive length in millimetres")
@@ -167,7 +167,7 @@ class Plan:
         Args:
             bins: the state, on the CPU.
             game: index of the bin.
-            id_names: text of each number that the state keeps as an item's id; by default the
+            id_names: text of each number that the state stores as an item's id; by default the
                 number itself.
             unit_mm: millimetres of a cell, if known.
         """
@@ -206,7 +206,7 @@ class Plan:
 
     @property
     def utilization(self) -> float:
-        """Share of the volume of all bins that the boxes fill."""
+        """Share of the volume of all bins that is filled by boxes."""
         return float(self.sides.prod(1).sum() / self.bin_sizes.prod(1).sum())
 
     def first(self, count: int) -> Plan:
@@ -219,7 +219,7 @@ class Plan:
         return self._select(self.bins == index, np.zeros_like(self.bins), sizes)
 
     def _select(self, which: NDArray[np.bool_], bins: Array, bin_sizes: Array) -> Plan:
-        """Return the chosen boxes, bool [n], with other bins."""
+        """Return the plan of the boxes ``which``, in other bins."""
         return Plan(
             bin_sizes, bins[which], self.positions[which], self.sides[which],
             self.orientations[which], self.weights[which], self.centres[which],
@@ -265,7 +265,7 @@ class Plan:
         """Read a plan that :meth:`to_json` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for a value that cannot be.
+            ValueError: if it is another kind of file, or for an impossible value.
         """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -287,7 +287,7 @@ class Plan:
         """
         empty = sorted(set(range(len(self.bin_sizes))) - set(self.bins.tolist()))
         if empty:
-            raise ValueError(f"{path}: bin {empty[0]} is empty, which CSV cannot hold; write JSON")
+            raise ValueError(f"{path}: bin {empty[0]} is empty: needs JSON, as CSV cannot hold it")
         unit = "" if self.unit_mm is None else self.unit_mm
         sizes = self.bin_sizes[self.bins].tolist()
         text = io.StringIO(newline="")
@@ -302,7 +302,7 @@ class Plan:
         """Read a plan that :meth:`to_csv` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for a value that cannot be.
+            ValueError: if it is another kind of file, or for an impossible value.
         """
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             header, *lines = list(csv.reader(file)) or [[]]

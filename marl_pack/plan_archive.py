@@ -34,10 +34,10 @@ def save_plans(path: Path, plans: Sequence[Plan]) -> None:
     boxes = _padded([plan.boxes for plan in plans])
     if boxes.dtype.kind == "i" and boxes.max(initial=0) <= np.iinfo(np.int16).max:
         boxes = boxes.astype(np.int16)
-    same = sizes.shape[1] == 1 and bool((sizes == sizes[0]).all())
+    uniform = sizes.shape[1] == 1 and bool((sizes == sizes[0]).all())
     units = [np.nan if plan.unit_mm is None else plan.unit_mm for plan in plans]
     arrays: dict[str, Any] = {
-        "bin": sizes[0, 0] if same else sizes,
+        "bin": sizes[0, 0] if uniform else sizes,
         "count": np.array([len(plan) for plan in plans]),
         "boxes": boxes,
         "loads": _padded([plan.loads for plan in plans]),
@@ -60,10 +60,10 @@ def _padded(rows: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def load_plans(path: str | Path) -> list[Plan]:
-    """Read an archive of plans; one without orientations, ids, bins and units is read, too.
+    """Read an archive of plans, also one without orientations, ids, bins and units.
 
     Raises:
-        ValueError: if it is another kind of file, or for a value that cannot be.
+        ValueError: if it is another kind of file, or for an impossible value.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -81,7 +81,7 @@ def load_plans(path: str | Path) -> list[Plan]:
         "bins": np.zeros((e, most), np.int64), UNIT: np.full(e, np.nan),
     } | arrays  # fmt: skip
     sizes = np.broadcast_to(size, (e, 1, 3)) if size.shape == (3,) else size
-    fitting = (
+    consistent = (
         boxes.shape == (e, most, 6) and loads.shape == (e, most, 3)
         and sizes.ndim == 3 and (len(sizes), sizes.shape[2]) == (e, 3)
         and all(arrays[key].shape == (e, most) for key in ("orientations", "ids", "bins"))
@@ -89,8 +89,8 @@ def load_plans(path: str | Path) -> list[Plan]:
         and (boxes.dtype.kind in "iu") == (size.dtype.kind in "iu")
         and bool(((count >= 0) & (count <= most)).all())
     )  # fmt: skip
-    if not fitting:
-        raise ValueError(f"{path}: {NOT_PLANS}: its arrays do not go together")
+    if not consistent:
+        raise ValueError(f"{path}: {NOT_PLANS}: needs arrays of matching shapes")
     plans = []
     for k, n in enumerate(count.tolist()):
         unit = float(arrays[UNIT][k])

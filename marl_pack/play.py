@@ -38,21 +38,21 @@ def parser() -> argparse.ArgumentParser:
 
 
 def run(chosen: argparse.Namespace, console: Console) -> None:
-    """Play the game the options ask for, print its turns and draw its end.
+    """Play the game that the options choose, print its turns and draw its end.
 
     Raises:
-        ValueError, FileNotFoundError: if an option cannot be, naming what would be right.
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
     if chosen.picture.suffix.lower() != ".png":
         raise ValueError(f"--picture {chosen.picture}: needs the ending .png")
     check_writable(chosen.picture)
     setup = choose(chosen, console)
     if len(setup.policies) > 1:
-        raise ValueError("--policy: one plays here; evaluate compares several")
+        raise ValueError("--policy: needs one policy; marl_pack.evaluate compares several")
     ((name, policy),) = setup.policies.items()
-    known = setup.stream.episodes
-    if chosen.episode < 0 or (known and chosen.episode >= known):
-        most = f" … {known - 1}" if known else " or more"
+    episodes = setup.stream.episodes
+    if chosen.episode < 0 or (episodes and chosen.episode >= episodes):
+        most = f" … {episodes - 1}" if episodes else " or more"
         raise ValueError(f"--episode {chosen.episode}: needs 0{most}")
     game = setup.game(1, chosen.episode)
     table = Table(title=f"{name} plays {setup}, episode {chosen.episode}")
@@ -62,7 +62,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
         item, count = game.items.sides[0].tolist(), int(game.bins.count)
         orientation, cell = policy(game)
         outcome = game.place(orientation, cell)
-        # Without a mask of orientations the one chosen may have no place, which ends the game.
+        # Without a mask of orientations the chosen one may have no legal cell: that ends the game.
         placed = int(outcome.placed) > count
         axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
         table.add_row(

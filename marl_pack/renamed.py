@@ -1,4 +1,4 @@
-"""Names that were renamed: old checkpoints are read with them, users are told the new one."""
+"""Old names and what they are called now, for old checkpoints and for messages."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def refuse_old(name: str, names: Mapping[str, str], kind: str) -> None:
     """Raise ValueError with the new name if ``name`` is an old one.
 
     Args:
-        name: as it was given.
+        name: the name to check.
         names: old name → new name.
-        kind: what the name is of, for the message.
+        kind: the kind of thing that it names, for the message.
     """
     if name in names:
         raise ValueError(f"{kind} {name!r} is now called {names[name]!r}")

@@ -1,8 +1,8 @@
 """Train the orientation and the placement agent.
 
 ``python -m marl_pack.train --config configs/rs.yaml --seed 1`` makes a run's folder with the
-resolved settings, checkpoints, TensorBoard's logs and the history of evaluations;
-``--resume runs/NAME`` goes on with it. ``--help`` lists every setting.
+resolved settings, checkpoints, TensorBoard's logs and the history of evaluations.
+``--resume runs/NAME`` continues it. ``--help`` lists every setting.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def train(
     console: Console,
     checkpoint: Mapping[str, Any] | None = None,
 ) -> Runner:
-    """Run the training to its end.
+    """Run the training of a run to its end.
 
     Args:
         config: the settings.
@@ -41,7 +41,7 @@ def train(
 
     Raises:
         RunInterruptedError: after SIGINT or SIGTERM, with a checkpoint written.
-        ConfigError, ValueError: if a setting or the checkpoint cannot be.
+        ConfigError, ValueError: if a setting is impossible or the checkpoint cannot be resumed.
     """
     torch.set_num_threads(config.threads)
     total = config.ppo.max_iterations
@@ -55,7 +55,7 @@ def train(
         config,
         folder,
         checkpoint,
-        evaluate=lambda made: evaluation(config, made),
+        evaluate=lambda current: evaluation(config, current),
         show=display.show if rank() == 0 else lambda progress: None,
         evaluated=evaluated,
     )
@@ -63,11 +63,11 @@ def train(
         write_record(folder, config, sys.argv[1:])
 
     def stop(number: int, frame: object) -> None:
-        if runner.stop_requested:  # asked twice: at once
+        if runner.stop_requested:  # a second signal stops at once
             raise KeyboardInterrupt
         runner.stop_requested = True
         if rank() == 0:
-            console.print("stopping after this iteration; once more stops at once")
+            console.print("stopping after this iteration; a second signal stops at once")
 
     before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -85,18 +85,18 @@ def train(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command ``python -m marl_pack.train``."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    """Run the command ``python -m marl_pack.train``; return its exit status."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
     console = Console()
     run, folder = None, None
     try:
-        run, rest = _resume_option(given)
+        run, rest = _resume_option(words)
         checkpoint = None
         if run is not None:
             config, checkpoint = resumed(run, rest)
             folder = Path(run) if Path(run).is_dir() else Path(run).parent
         else:
-            config, _ = parse(given)
+            config, _ = parse(words)
             folder = new_folder(config) if rank() == 0 else Path(config.output.folder)
         if rank() == 0:
             console.print(f"run: {folder}", soft_wrap=True)
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RunInterruptedError:
         if rank() == 0:
             console.print(
-                f"stopped with a checkpoint; go on with --resume {folder}", soft_wrap=True
+                f"stopped with a checkpoint; continue with --resume {folder}", soft_wrap=True
             )
         return 130
     except KeyboardInterrupt:
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (ConfigError, OSError, ModuleNotFoundError) as error:
         if run is None and rank() == 0 and folder is not None:
-            with contextlib.suppress(OSError):  # nothing has begun, unless something is in it
+            with contextlib.suppress(OSError):  # the run has not begun, unless the folder has files
                 folder.rmdir()
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 2
@@ -128,21 +128,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _resume_option(given: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return what follows --resume, None without it, and the other options.
+def _resume_option(words: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the value of --resume (None without it), and the other options.
 
     Raises:
-        ConfigError: if nothing follows it.
+        ConfigError: if --resume has no value.
     """
     first = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     first.add_argument("--resume")
     try:
-        known, rest = first.parse_known_args(given)
+        options, rest = first.parse_known_args(words)
     except argparse.ArgumentError:
         raise ConfigError("--resume needs a run's folder") from None
-    if known.resume == "":
+    if options.resume == "":
         raise ConfigError("--resume needs a run's folder")
-    return known.resume, rest
+    return options.resume, rest
 
 
 if __name__ == "__main__":

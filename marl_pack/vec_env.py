@@ -13,7 +13,7 @@ from marl_pack.game.packing import Packing
 
 
 class PackingVecEnv(VecEnv):
-    """Games with ``auto_reset`` as rsl_rl's runner drives them, one item a step.
+    """G games with ``auto_reset`` behind the interface of rsl_rl's runner, one item a step.
 
     A step of the game has two turns. The runner sees the first one's observation; what the
     placement agent observes depends on the orientation, so the algorithm asks the game for it.
@@ -43,7 +43,7 @@ class PackingVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Items placed in each bin, int64 [G]."""
+        """Number of items placed in each game's episode, int64 [G]."""
         return self.game.t
 
     @episode_length_buf.setter
@@ -51,12 +51,12 @@ class PackingVecEnv(VecEnv):
         raise ValueError("an episode cannot begin in its middle: leave init_at_random_ep_len False")
 
     def get_observations(self) -> TensorDict:
-        """Return what the agent of the first turn observes."""
+        """Return the observation of the agent that acts first."""
         observation = dict(self.observe(self.game))
         return TensorDict(observation, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Place the items.
+        """Place the visible item of each game.
 
         Args:
             actions: int64 [G, 2], orientation and cell, taken from the masks.

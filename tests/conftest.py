@@ -19,7 +19,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
-    """The published test sequences, where MARL_PACK_DATA says they are."""
+    """The folder of the published test sequences, named by MARL_PACK_DATA."""
     folder = os.environ.get("MARL_PACK_DATA")
     if not folder or not (Path(folder) / "rs.npz").is_file():
         pytest.skip("MARL_PACK_DATA does not name a folder with rs.npz and cut_1.npz")
@@ -27,7 +27,7 @@ def data_folder() -> Path:
 
 
 def stack(size: tuple[int, int, int], *boxes: tuple[int, int, int, int, int, int]) -> Bins:
-    """One bin with boxes x, y, z, w, d, h set into it; fails if one does not rest at its z."""
+    """One bin with the boxes x, y, z, w, d, h; fails if one does not rest at its z."""
     bins = state.empty(1, size, max_boxes=len(boxes) + 1)
     for x, y, z, w, d, h in boxes:
         rest, *_ = state.place(
@@ -40,7 +40,7 @@ def stack(size: tuple[int, int, int], *boxes: tuple[int, int, int, int, int, int
 def random_play(
     rule: Rule, n: int, size: tuple[int, int, int], sides: tuple[int, int], steps: int, seed: int
 ) -> Bins:
-    """N bins in which up to ``steps`` random boxes stand where ``rule`` allows them."""
+    """N bins with up to ``steps`` random boxes at cells that ``rule`` allows."""
     generator = torch.Generator().manual_seed(seed)
     bins = state.empty(n, size, max_boxes=steps)
     for _ in range(steps):
@@ -57,7 +57,7 @@ def random_play(
 def random_maps(
     n: int, size: tuple[int, int, int], sides: tuple[int, int], steps: int, seed: int
 ) -> Bins:
-    """N bins in which boxes were dropped anywhere, standing or not."""
+    """N bins with boxes placed anywhere, stable or not."""
 
     def anywhere(bins: Bins, item) -> torch.Tensor:
         top = resting_heights(bins.heightmap, item.sides) + item.sides[..., 2, None, None]
@@ -86,7 +86,7 @@ def off_centre(items: Tensor, seed: int) -> OrientedItem:
 
 
 def in_play(n: int, steps: int, **settings: object) -> Packing:
-    """A game that random play has begun."""
+    """A game after some steps of random play."""
     game = Packing(n, seed=4, **settings)  # type: ignore[arg-type]  # a game's options have many types
     policy = make_policy("random", seed=1)
     for _ in range(steps):

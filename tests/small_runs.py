@@ -18,7 +18,7 @@ TINY = (
 
 
 def tiny(*options: str) -> Config:
-    """Return the settings of a run that takes a moment."""
+    """Return the settings of a run that takes a few seconds."""
     return parse([*TINY, *options])[0]
 
 

@@ -1,4 +1,4 @@
-"""The critic of afterstates: features, values of placements, learning, and who owns it."""
+"""The critic of afterstates: features, values of placements, learning, and its owner."""
 
 from collections import Counter
 from dataclasses import replace
@@ -66,7 +66,7 @@ def features_of(game: Packing, orientation: Tensor, cell: Tensor) -> Tensor:
 def test_features_do_not_change_when_the_bin_is_rotated() -> None:
     game = in_play(16, 6)
     o, c = make_policy("dblf")(game)
-    here = features_of(game, o, c)
+    own = features_of(game, o, c)
     other = in_play(16, 6)
     for maps in (other.bins.heightmap, other.bins.empty_map):
         maps.copy_(maps.transpose(1, 2).flip(1).clone())
@@ -76,8 +76,8 @@ def test_features_do_not_change_when_the_bin_is_rotated() -> None:
     x, y = game.floor.corner(c)
     cell = other.floor.cell(10 - width - y, x)
     assert other.moves.allows(o ^ 1, cell).all()
-    assert torch.allclose(here, features_of(other, o ^ 1, cell), atol=1e-6)
-    assert here.shape == (16, FEATURES)
+    assert torch.allclose(own, features_of(other, o ^ 1, cell), atol=1e-6)
+    assert own.shape == (16, FEATURES)
 
 
 def test_boxes_of_fewer_lengths_take_the_places_of_the_longest() -> None:
@@ -85,9 +85,9 @@ def test_boxes_of_fewer_lengths_take_the_places_of_the_longest() -> None:
     many.set_state(replace(many.state, items=few.items))
     rows = torch.tensor([0])
     first, second = (features(Lookahead().afterstates(game), 1000, rows)[0] for game in (few, many))
-    known = first != 0
-    assert torch.equal(first[known], second[known])
-    assert int((second != 0).sum()) > int(known.sum())
+    used = first != 0
+    assert torch.equal(first[used], second[used])
+    assert int((second != 0).sum()) > int(used.sum())
 
 
 def test_the_afterstate_value_is_the_reward_and_the_critics_value() -> None:
@@ -125,7 +125,7 @@ def test_values_are_computed_once_a_turn_and_again_after_the_critic_has_learned(
     assert torch.equal(lookahead.afterstate_value(branched), second[games])
 
 
-def test_the_afterstate_value_is_seen_beside_the_best() -> None:
+def test_the_afterstate_value_is_observed_relative_to_the_best() -> None:
     game, lookahead = in_play(6, 5), Lookahead(AfterstateCritic())
     planes = ["afterstate_value"]
     observation = observe("orientation", game, planes, lookahead)
@@ -148,7 +148,7 @@ def test_the_afterstate_value_is_seen_beside_the_best() -> None:
 
 
 @pytest.mark.parametrize("rollouts", [3, 64])
-def test_the_learner_predicts_returns_and_remembers_the_last_rollouts(
+def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
     rollouts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(critics, "REMEMBERED", rollouts * 4 * 32)
@@ -174,7 +174,7 @@ def test_the_learner_predicts_returns_and_remembers_the_last_rollouts(
     assert remembered == pytest.approx(sorted(last))
     assert all(weight.grad is None for weight in critic.parameters())
     learner.record(game, *policy(game))
-    with pytest.raises(ValueError, match="1 steps recorded, a rollout has 4"):
+    with pytest.raises(ValueError, match="1 steps recorded: needs a rollout's 4"):
         learner.learn(rewards, rewards, 1e-3)
 
 
@@ -239,7 +239,7 @@ def tensors(value: object) -> list[Tensor]:
     return [tensor for part in parts for tensor in tensors(part)]
 
 
-def test_a_run_begins_with_the_critic_of_another_run_or_a_fresh_one(tmp_path: Path) -> None:
+def test_a_run_begins_with_the_critic_of_another_run_or_a_new_one(tmp_path: Path) -> None:
     first = small_runner(tmp_path / "run", *BOTH_SEE_VALUES)
     first.train(1)
     assert first.alg.lookahead.critic is not None

@@ -1,4 +1,4 @@
-"""Every backend gives the numbers of the slow reference, or those of the others, cell by cell."""
+"""Every backend gives the results of the reference, or of the other backends, cell by cell."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -233,7 +233,7 @@ def test_no_bins_and_orientations_that_are_not_allowed_have_no_cell(
 def fields_of(
     left: Afterstates, mask: torch.Tensor, allowed: tuple[int, ...]
 ) -> list[torch.Tensor]:
-    """Everything that is known of each placement, on the bins' maps."""
+    """Every value of each placement, on the bins' maps."""
     numbers = [
         left.counts.flatten(1), left.surface, left.volume[:, None], left.waste[:, None],
         left.filled[:, None], left.feasible_cells()[:, None],

@@ -25,7 +25,7 @@ def test_gaps_under_gaps_add_up() -> None:
     assert bins.empty_map[0, :, 0].tolist() == [0, 2, 2, 3, 3]
 
 
-def test_place_tells_resting_height_and_waste() -> None:
+def test_place_returns_resting_height_and_waste() -> None:
     bins = stack((6, 6, 9), (0, 0, 0, 3, 3, 4))
     rest, waste, volume = state.place(
         bins, torch.tensor([[4, 2, 1]], dtype=torch.int16), torch.tensor([[1, 2]])
@@ -35,7 +35,7 @@ def test_place_tells_resting_height_and_waste() -> None:
     assert int(waste) == 8 * 4 - 2 * 4  # 8 columns, of which x = 1, 2 at y = 2 are filled
 
 
-def test_heightmap_minus_empty_map_is_what_the_boxes_fill() -> None:
+def test_heightmap_minus_empty_map_counts_the_cells_of_the_boxes() -> None:
     bins = random_maps(32, (7, 5, 12), (1, 4), 20, seed=0)
     for i in range(32):
         filled = np.zeros((7, 5), int)
@@ -53,7 +53,7 @@ def test_a_zero_sided_box_changes_nothing() -> None:
         assert torch.equal(now, then)
 
 
-def test_labels_are_kept_with_the_boxes_and_unknown_by_default() -> None:
+def test_labels_are_stored_with_the_boxes_and_unknown_by_default() -> None:
     bins = state.empty(2, (4, 4, 9), max_boxes=2)
     boxes = torch.tensor([[2, 2, 1], [1, 3, 2]], dtype=torch.int16)
     state.place(
@@ -75,7 +75,7 @@ def test_a_view_of_other_bins_has_the_same_backend() -> None:
     assert state.empty(1, (4, 4, 9)).backend is Backend.COMPILED
 
 
-def test_orientations_are_the_six_permutations_in_turned_pairs() -> None:
+def test_orientations_are_the_six_permutations_in_rotated_pairs() -> None:
     assert len(set(ORIENTATIONS)) == 6
     assert ORIENTATIONS[0] == (0, 1, 2)
     for o, (a, b, c) in enumerate(ORIENTATIONS):
@@ -94,10 +94,10 @@ def test_cleared_bins_are_empty_and_the_others_untouched() -> None:
     bins = random_maps(6, (5, 5, 9), (1, 4), 6, seed=3)
     before = bins.clone()
     state.clear(bins, torch.tensor([1, 4]))
-    kept = torch.tensor([0, 2, 3, 5])
+    others = torch.tensor([0, 2, 3, 5])
     assert int(bins.filled[[1, 4]].sum()) == 0
     assert int(bins.heightmap[[1, 4]].sum()) == 0
-    for now, then in zip(bins[kept].tensors(), before[kept].tensors(), strict=True):
+    for now, then in zip(bins[others].tensors(), before[others].tensors(), strict=True):
         assert torch.equal(now, then)
 
 

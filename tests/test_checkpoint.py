@@ -1,4 +1,4 @@
-"""Checkpoints: what they rebuild, and which files are refused."""
+"""Checkpoints rebuild their policies, and other files are refused."""
 
 from pathlib import Path
 
@@ -51,15 +51,15 @@ def test_agents_of_different_sources_play_together(runs: Path) -> None:
 def test_evaluate_takes_runs_and_mixtures(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--episodes", "20", "--policy", str(runs / "both"), "dblf"]
     assert evaluate([*options, "--orientation", "first", "--placement", str(runs / "frozen")]) == 0
-    shown = "".join(capsys.readouterr().out.split())
-    assert "trainedonrs2-5,bin10x10x10,rulehull_alpha,32items,seed0" in shown
-    assert shown.count("100.00") == 3  # the column "in equilibrium %"
+    output = "".join(capsys.readouterr().out.split())
+    assert "trainedonrs2-5,bin10x10x10,rulehull_alpha,32items,seed0" in output
+    assert output.count("100.00") == 3  # the column "in equilibrium %"
 
 
 @pytest.mark.parametrize(("options", "message"), [
     (["--orientation", "first"], "go together"),
-    (["--policy", "nobody"], "'nobody' is neither one of dblf"),
-    (["--orientation", "nobody", "--placement", "dblf"], "first nor a checkpoint"),
+    (["--policy", "nobody"], "'nobody': needs one of dblf"),
+    (["--orientation", "nobody", "--placement", "dblf"], "first, a checkpoint or a run's folder"),
     (["--policy", "most_room"], "policy 'most_room' is now called 'max_feasible'"),
     (["--orientation", "first", "--placement", "most_room"], "'most_room' is now called"),
 ])  # fmt: skip
@@ -91,7 +91,7 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
         checkpoints.read(path)
     with pytest.raises(FileNotFoundError, match="no such checkpoint"):
         checkpoints.read(tmp_path / "none.pt")
-    with pytest.raises(FileNotFoundError, match=r"neither best\.pt nor latest\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"needs best\.pt or latest\.pt"):
         checkpoints.read(tmp_path)
     damaged = bytearray(whole)
     damaged[len(whole) // 2] ^= 255
@@ -103,12 +103,12 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
         checkpoints.read(path)
 
 
-def test_weights_that_do_not_fit_and_agents_that_are_missing_are_named(runs: Path) -> None:
-    with pytest.raises(ValueError, match="orientation agent's weights do not fit"):
+def test_mismatched_weights_and_missing_agents_are_named(runs: Path) -> None:
+    with pytest.raises(ValueError, match="orientation agent's weights do not match"):
         load_actor({"network": {"c": 1}}, "orientation", "cpu")
     checkpoint = checkpoints.read(runs / "both")
     checkpoint["agents"]["placement"]["network"]["channels"] = 16
-    with pytest.raises(ValueError, match="placement agent's weights do not fit"):
+    with pytest.raises(ValueError, match="placement agent's weights do not match"):
         Loader().policy_of(checkpoint)
     with pytest.raises(ValueError, match="no orientation agent; it has: joint"):
         record_of(str(runs / "joint"), "orientation")

@@ -52,9 +52,9 @@ def test_the_main_config_holds_every_key_at_its_default() -> None:
 def test_every_key_is_explained_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parse(["--help"])
-    shown = re.sub(r"\s+", " ", capsys.readouterr().out)
+    output = re.sub(r"\s+", " ", capsys.readouterr().out)
     for key in keys(make_parser()):
-        explained = re.search(rf"--{re.escape(key)} (.*?) \(type: ", shown)
+        explained = re.search(rf"--{re.escape(key)} (.*?) \(type: ", output)
         assert explained is not None, key
         assert len(explained[1].split()) >= 4, key
 
@@ -69,7 +69,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     assert again.orientation == Agent(frozen=True, policy="first")
 
 
-@pytest.mark.parametrize(("options", "told"), [
+@pytest.mark.parametrize(("options", "expected"), [
     (["--ppo.gama=0.9"], r"unknown key ppo\.gama\. Did you mean ppo\.gamma\? Keys in ppo: clip"),
     (["--sed=1"], r"unknown key sed\. Did you mean seed\? Keys: device, evaluation"),
     (["--ppo.gamma=much"], r"ppo\.gamma.*float.*much"),
@@ -115,8 +115,8 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--seed=-1"], r"seed = -1: needs 0 or more"),
     (["--output.name=.."], r"output\.name"),
 ])  # fmt: skip
-def test_a_mistake_is_named_with_what_would_be_right(options: list[str], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_a_mistake_is_named_with_what_would_be_right(options: list[str], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
         parse(options)
 
 
@@ -124,25 +124,27 @@ def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     path = tmp_path / "typo.yaml"
     path.write_text("placement:\n  network:\n    chanels: 3\n")
     assert main([f"--config={path}"]) == 2
-    told = capsys.readouterr().err
-    assert "unknown key placement.network.chanels. Did you mean placement.network.channels?" in told
+    message = capsys.readouterr().err
+    assert (
+        "unknown key placement.network.chanels. Did you mean placement.network.channels?" in message
+    )
     path.write_text("pppo:\n  gamma: 3\n")
     assert main([f"--config={path}"]) == 2
     assert "unknown key pppo.gamma" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("text", "told"), [
+@pytest.mark.parametrize(("text", "expected"), [
     (b"", "needs keys and values"),
     (b"- 1", "needs keys and values"),
     (b"seed: [1", "not YAML"),
     (b"name: \xff", "not a text in UTF-8"),
-    (b"ppo:\n  gamma: 0.9\n  lam: 0.9\n  gamma: 0.8\n", "line 4: ppo.gamma stands there twice"),
+    (b"ppo:\n  gamma: 0.9\n  lam: 0.9\n  gamma: 0.8\n", "line 4: ppo.gamma is given twice"),
     (b"ppo:\n", "line 1: ppo is a section"),
     (b"placement:\n  network: 3\n", "line 2: placement.network is a section"),
-    (b"resume: runs/x\n", "line 1: --resume goes on the command line"),
+    (b"resume: runs/x\n", "line 1: --resume needs to be on the command line"),
 ])  # fmt: skip
 def test_a_broken_file_is_named_with_the_line(
-    text: bytes, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: bytes, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "broken.yaml"
     path.write_bytes(text)
@@ -150,24 +152,24 @@ def test_a_broken_file_is_named_with_the_line(
         assert main(options) == 2
         message = capsys.readouterr().err
         assert str(path) in message
-        assert told in message
+        assert expected in message
 
 
-@pytest.mark.parametrize(("options", "told"), [
+@pytest.mark.parametrize(("options", "expected"), [
     (["--device=abacus"], "device 'abacus'"),
     (["--game.items=rs", "--game.bin=[4,4,4]"], "game.items: items 'rs' with sides 2..5"),
     (["--game.items=nowhere.npz"], "nowhere.npz"),
     (["--game.orientations=[7]"], "orientations"),
     (["--game.rule=lbcp", "--game.thresholds=paper"], "thresholds"),
     (["--orientation.frozen=true", "--orientation.policy=nobody"],
-     "orientation.policy: 'nobody' is neither one of"),
+     "orientation.policy: 'nobody': needs one of"),
     (["--placement.teacher=nobody", "--placement.teacher_iterations=5"],
-     "placement.teacher: 'nobody' is neither one of dblf"),
+     "placement.teacher: 'nobody': needs one of dblf"),
     (["--placement.teacher=first", "--placement.teacher_iterations=5"],
-     "placement.teacher: 'first' is neither one of dblf"),
+     "placement.teacher: 'first': needs one of dblf"),
 ])  # fmt: skip
-def test_what_only_the_game_can_refuse_is_told_as_plainly(
-    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_errors_of_the_game_and_of_agents_are_reported_as_plainly(
+    options: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*options, f"--output.folder={tmp_path}"]) == 2
-    assert told in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

@@ -38,13 +38,13 @@ VARIANTS: list[dict[str, Any]] = [
 
 
 def mask_of(env: Any, agent: str) -> np.ndarray:
-    seen = env.observe(agent)
-    return seen["action_mask"] if isinstance(seen, dict) else env.infos[agent]["action_mask"]
+    value = env.observe(agent)
+    return value["action_mask"] if isinstance(value, dict) else env.infos[agent]["action_mask"]
 
 
 def planes_of(env: Any, agent: str) -> np.ndarray:
-    seen = env.observe(agent)
-    return seen["observation"] if isinstance(seen, dict) else seen
+    value = env.observe(agent)
+    return value["observation"] if isinstance(value, dict) else value
 
 
 def play(env: Any, seed: int) -> list[tuple[str, int, float]]:
@@ -143,7 +143,7 @@ def test_spaces_are_as_documented() -> None:
     assert isinstance(bare.observation_space(O), spaces.Box)
 
 
-def test_planes_show_heights_and_the_turned_item() -> None:
+def test_planes_show_heights_and_the_rotated_item() -> None:
     env = env_aec.env(bin_size=(10, 8, 20), items=[[2, 4, 6], [3, 3, 5], [1, 1, 1]])
     env.reset(seed=0)
     for agent in (O, P):
@@ -200,16 +200,16 @@ def test_the_environment_plays_the_batched_game_step_by_step(arguments: dict[str
 
 def test_the_parallel_environment_never_shows_a_stale_mask() -> None:
     env = env_aec.parallel_env()
-    seen, _ = env.reset(seed=3)
+    observation, _ = env.reset(seed=3)
     generator = np.random.default_rng(3)
     core = env.unwrapped
     turns = 0
     while env.agents:
-        legal = {agent: np.flatnonzero(seen[agent]["action_mask"]) for agent in env.agents}
+        legal = {agent: np.flatnonzero(observation[agent]["action_mask"]) for agent in env.agents}
         acting = core.agent_selection
         assert [agent for agent in env.agents if len(legal[agent])] == [acting]
         choice = int(generator.choice(legal[acting]))
-        seen, rewards, ended, _, infos = env.step({O: choice, P: choice})
+        observation, rewards, ended, _, infos = env.step({O: choice, P: choice})
         assert rewards[O] == rewards[P]
         assert all("illegal" not in str(info) for info in infos.values())
         turns += 1
@@ -231,14 +231,14 @@ def test_masks_in_info_are_those_of_the_observation() -> None:
         other.step(action)
 
 
-def test_a_mask_that_was_shown_is_not_written_to() -> None:
+def test_a_mask_that_was_observed_is_not_written_to() -> None:
     env = env_aec.env()
     env.reset(seed=0)
-    seen = env.observe(O)
-    copy = {key: value.copy() for key, value in seen.items()}
+    observation = env.observe(O)
+    copy = {key: value.copy() for key, value in observation.items()}
     for _ in range(4):
         env.step(int(np.flatnonzero(env.observe(env.agent_selection)["action_mask"])[0]))
-    assert all((seen[key] == copy[key]).all() for key in seen)
+    assert all((observation[key] == copy[key]).all() for key in observation)
 
 
 # --- rewards, end, seeds --------------------------------------------------------------------------
@@ -365,7 +365,7 @@ def test_an_illegal_action_is_repaired_to_the_nearest_legal_one() -> None:
     assert "repaired" not in env.infos[O]
 
 
-def test_wrappers_stand_in_pettingzoos_order() -> None:
+def test_wrappers_are_in_pettingzoos_order() -> None:
     def chain(env: Any) -> list[type]:
         out = []
         while isinstance(env, wrappers.BaseWrapper):
@@ -390,7 +390,7 @@ def test_wrappers_stand_in_pettingzoos_order() -> None:
         ({"items": [[11, 11, 11]]}, "row 0"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: dict[str, Any], why: str) -> None:
+def test_impossible_arguments_are_refused(arguments: dict[str, Any], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         env_aec.env(**arguments)
 
@@ -400,7 +400,7 @@ def test_parallel_steps_of_both_agents_at_once_need_repair() -> None:
         env_aec.parallel_env(simultaneous=True)
 
 
-def test_whose_turn_it_is_stands_in_every_info() -> None:
+def test_every_info_names_the_acting_agent() -> None:
     env = env_aec.parallel_env(items=[[5, 5, 5]])
     _, infos = env.reset()
     assert [info["active_agent"] for info in infos.values()] == [O, O]
@@ -428,14 +428,14 @@ def test_observations_can_be_asked_for_before_the_first_reset() -> None:
 def test_an_episode_that_cannot_begin_is_skipped() -> None:
     rows = [[[2, 2, 9]], [[3, 3, 3]], [[2, 9, 2]], [[4, 4, 4]]]
     env = env_aec.raw_env(bin_size=(9, 5, 5), items=rows, orientations=(0,))
-    seen = []
+    observation = []
     for _ in range(3):
         env.reset()
-        seen.append(round(float(env.state()[1, 0, 0]) * 9))
-    assert seen == [3, 4, 3]
+        observation.append(round(float(env.state()[1, 0, 0]) * 9))
+    assert observation == [3, 4, 3]
 
 
-def test_a_first_item_without_a_place_is_refused_at_reset() -> None:
+def test_a_first_item_without_a_legal_cell_is_refused_at_reset() -> None:
     env = env_aec.env(margin=4.0)
     with pytest.raises(ValueError, match="may be placed nowhere"):
         env.reset(seed=0)

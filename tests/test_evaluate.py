@@ -93,14 +93,14 @@ def test_equal_episodes_have_an_interval_of_no_width() -> None:
     assert figures["std"] == 0
 
 
-def test_a_stack_that_falls_is_no_equilibrium() -> None:
+def test_a_stack_that_falls_is_not_in_equilibrium() -> None:
     balanced = [(0, 0, 0, 2, 2, 2), (0, 0, 2, 4, 2, 1)]  # on the edge
     falls = Plan.of_boxes((9, 9, 9), balanced, [(8, 1, 1), (8, 2, 1)])
     stands = Plan.of_boxes((9, 9, 9), [balanced[0], (0, 0, 2, 3, 2, 1)], [(8, 1, 1), (6, 1.5, 1)])
     assert [strict_equilibrium(plan) for plan in (falls, stands)] == [False, True]
 
 
-def test_every_bin_of_a_plan_has_to_stand() -> None:
+def test_every_bin_of_a_plan_must_be_in_equilibrium() -> None:
     rows = np.array([(0, 0, 0, 2, 2, 2), (0, 0, 0, 2, 2, 2), (0, 0, 2, 3, 2, 1)])
     for last, stands in ((0, False), (1, True)):  # in bin 0 the last box is on nothing
         plan = Plan(
@@ -118,7 +118,7 @@ def test_fractions_of_a_unit_are_not_judged_as_cells() -> None:
         strict_equilibrium(Plan.of_boxes((9, 9, 9), [(0, 0, 0, 2.5, 2, 2)]))
 
 
-def test_no_rule_but_a_sound_one_keeps_every_stack_standing(tmp_path: Path) -> None:
+def test_only_sound_rules_keep_every_stack_standing(tmp_path: Path) -> None:
     shares = {}
     for rule in ("hull_1", "hull_alpha", "lbcp", "equilibrium"):
         out = tmp_path / f"{rule}.json"
@@ -141,7 +141,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        ("--policy nobody", "'nobody' is neither"),
+        ("--policy nobody", "'nobody': needs one of"),
         ("--items missing.npz", "no such file"),
         ("--items sr", "unknown items|no such file"),
         ("--episodes 0", "--episodes 0"),
@@ -151,14 +151,14 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--bin 4 4 4", "longest side"),
         ("--orientations 7", "orientations"),
         ("--json nowhere/out.json", "does not exist"),
-        ("--policy dblf random --save-stacks s.npz", "one policy"),
+        ("--policy dblf random --save-stacks s.npz", "needs a single policy"),
         ("--json tests", "is a folder"),
         ("--device nowhere", "device 'nowhere'"),
         ("--device meta", "needs cpu, cuda"),
         ("--seed -1", "needs 0 or more"),
     ],
 )
-def test_what_cannot_be_is_refused_without_a_traceback(
+def test_impossible_options_are_refused_without_a_traceback(
     arguments: str, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -217,8 +217,8 @@ def test_a_checkpoints_own_game_is_played_unless_options_change_it(
     assert own["thresholds"] == "code"
     assert own["orientations"] == [0, 1]
     assert own["com_offset"] == [0.05, 0, 0]
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "rule area_ratio, thresholds code, orientations 0 1, centre of mass off by" in shown
+    output = " ".join(capsys.readouterr().out.split())
+    assert "rule area_ratio, thresholds code, orientations 0 1, centre of mass off by" in output
     other = settings("--rule", "hull_alpha", "--bin", "8", "8", "8", "--items", "cut2")
     assert (other["rule"], other["thresholds"]) == ("hull_alpha", None)
     assert (other["bin"], other["sides"], other["items"]) == ([8, 8, 8], [1, 3], "cut2")
@@ -234,7 +234,7 @@ def test_play_shows_the_game_and_draws_it(
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     for wrong, why in (
         (["--picture", "bin.xyz"], "ending .png"),
-        (["--policy", "dblf", "random", "--picture", str(path)], "one plays here"),
+        (["--policy", "dblf", "random", "--picture", str(path)], "needs one policy"),
         (["--episode", "-1", "--picture", str(path)], "needs 0"),
     ):
         with pytest.raises(SystemExit):

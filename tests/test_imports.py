@@ -1,4 +1,4 @@
-"""Imports run one way: from the programs down to the state of bins, and never in a circle."""
+"""Imports run one way: from the programs to the state of bins, without cycles."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -35,12 +35,12 @@ def modules() -> dict[str, Path]:
 
     ``__main__`` is the program of its package: nobody imports it, and it may import any program.
     """
-    found = {}
+    paths = {}
     for path in PACKAGE.rglob("*.py"):
         name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
         if path.stem != "__main__" and name != "__init__":
-            found[name.removesuffix(".__init__")] = path
-    return found
+            paths[name.removesuffix(".__init__")] = path
+    return paths
 
 
 MODULES = modules()
@@ -90,7 +90,7 @@ def test_no_packages_import_each_other() -> None:
     TopologicalSorter(own).prepare()
 
 
-def test_what_stands_below_knows_nothing_of_what_stands_above() -> None:
+def test_the_judge_the_environment_and_the_game_import_only_what_they_need() -> None:
     for module, others in graph().items():
         allowed = ONLY.get(module.split(".")[0])
         for other in others if allowed else ():

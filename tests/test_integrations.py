@@ -1,4 +1,4 @@
-"""What other people's trainers use: the network, and the compliance report of what they did."""
+"""The network and the compliance report that other trainers use."""
 
 import importlib.util
 import json
@@ -157,15 +157,15 @@ def test_reports_make_a_table(
     assert run("CleanRL's style", "marl_pack", train, [*SMALL, "--json", str(file)]) == 0
     monkeypatch.setattr(sys, "argv", ["report", str(tmp_path)])
     assert show_reports() == 0
-    shown = capsys.readouterr().out.splitlines()[-2]
+    row = capsys.readouterr().out.splitlines()[-2]
     report = json.loads(file.read_text())
     before, after = (f"{100 * report[k][0]:.1f} ± {100 * report[k][1]:.1f} %"
                      for k in ("before", "after"))  # fmt: skip
-    assert "CleanRL's style" in shown
-    assert "5 × 5 × 5" in shown
-    assert f"  {report['items']}  " in shown
-    assert before in shown
-    assert after in shown
+    assert "CleanRL's style" in row
+    assert "5 × 5 × 5" in row
+    assert f"  {report['items']}  " in row
+    assert before in row
+    assert after in row
 
     file.write_text(json.dumps(report | {"illegal": 1}))
     assert show_reports() == 1

@@ -152,7 +152,7 @@ def test_an_impossible_item_is_refused_with_its_row(
             load(path, BIN)
 
 
-def test_an_item_that_fits_lying_down_is_taken() -> None:
+def test_an_item_that_fits_lying_down_is_accepted() -> None:
     assert check_items([[2, 2, 9]], (10, 4, 4)).items.sides.tolist() == [[[2, 2, 9]]]
 
 
@@ -233,7 +233,7 @@ def test_the_published_sequences_are_read(data_folder: Path) -> None:
         assert sequences.episodes == 2100
 
 
-def test_items_one_by_one_are_as_probable_as_in_their_sequences() -> None:
+def test_independent_items_are_as_probable_as_in_their_sequences() -> None:
     rows = [[[2, 2, 2], [3, 3, 3]], [[2, 2, 2], [4, 5, 3]]]
     drawn = independent(make_stream(rows, BIN))
     state = drawn.start(3, torch.arange(4000))
@@ -323,7 +323,7 @@ def test_goods_have_the_same_attributes_however_they_are_given(kind: str, tmp_pa
     assert items.sides.tolist() == [[5, 5, 5], [0, 0, 0]]
 
 
-def test_a_csv_writes_attributes_in_words(tmp_path: Path) -> None:
+def test_a_csv_file_holds_attributes_as_words(tmp_path: Path) -> None:
     (tmp_path / "goods.csv").write_text(CSV)
     stream, _ = load(tmp_path / "goods.csv", BIN)
     assert fingerprint(stream) == fingerprint(make_stream(GOODS, BIN))
@@ -451,7 +451,7 @@ def test_attributes_that_exclude_each_other_are_refused(attributes: dict, why: s
         check_items([[2, 2, 2], [2, 2, 5]], (6, 6, 4), **attributes)
 
 
-def test_upright_may_stand_beside_orientations_within_it() -> None:
+def test_upright_may_be_combined_with_upright_orientations() -> None:
     goods = {"orientations": [[0], [2, 3], [1]], "upright": [True, False, False]}
     stream = check_items(ROWS, BIN, **goods)
     assert stream.items.orientations[0].int().argmax(1).tolist() == [0, 2, 1]
@@ -552,7 +552,7 @@ def stream_of(name: str, backend: Backend) -> object:
 
 @pytest.mark.parametrize("backend", Backend)
 @pytest.mark.parametrize("name", ["rs", "cut1", "cut2", "sequences", "drawn"])
-def test_a_restart_begins_what_ended_and_leaves_the_rest(name: str, backend: Backend) -> None:
+def test_a_restart_changes_only_the_episodes_that_ended(name: str, backend: Backend) -> None:
     stream = stream_of(name, backend)
     before = stream.start(3, torch.arange(6))
     copy = before.clone()

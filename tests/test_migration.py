@@ -1,4 +1,4 @@
-"""Checkpoints of format 1 are read as those of format 2."""
+"""Checkpoints of format 1 are migrated to format 2."""
 
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def test_a_model_of_format_1_is_read_as_format_2(path: Path) -> None:
 
 @pytest.mark.parametrize("path", ORIGINALS[:1], ids=lambda path: path.stem)
 def test_the_export_of_a_migrated_model_loads_into_a_stock_ppo(path: Path, tmp_path: Path) -> None:
-    """With the optimiser's state, whose parameters are numbered without the removed critic."""
+    """The optimiser's parameters are numbered without those of the removed critic."""
     assert export([str(path), "--format", "rsl_rl", "--folder", str(tmp_path)]) == 0
     settings = configs.from_dict(checkpoints.read(path)["config"])
     settings.init = str(path)
@@ -124,7 +124,7 @@ def read(folder: Path, agents: dict[str, Any], **config: Any) -> dict[str, Any]:
     return checkpoints.read(path)
 
 
-def test_a_learner_gives_up_its_copy_of_the_critic(tmp_path: Path) -> None:
+def test_a_learner_loses_its_copy_of_the_critic(tmp_path: Path) -> None:
     checkpoint = read(tmp_path, {"orientation": learner(), "placement": learner()})
     assert same(checkpoint["afterstate_critic"], OWN)
     assert checkpoint["afterstate_optimizer"] == {"state": {}}
@@ -138,7 +138,7 @@ def test_a_learner_gives_up_its_copy_of_the_critic(tmp_path: Path) -> None:
         assert moments == {0: 0, 1: 1, 2: 4, 3: 5}
 
 
-def test_frozen_networks_and_teachers_keep_critics_of_their_own(tmp_path: Path) -> None:
+def test_frozen_networks_and_teachers_have_critics_of_their_own(tmp_path: Path) -> None:
     agents = {
         "orientation": learner(imitated=network_of(TEACHER)), "placement": network_of(FROZEN)
     }  # fmt: skip
@@ -213,7 +213,7 @@ def test_a_run_of_format_1_is_not_resumed(
     capsys.readouterr()
     assert train(["--resume", str(tmp_path / "run"), "--ppo.max_iterations=2"]) == 2
     message = capsys.readouterr().err
-    assert "this run cannot be resumed: it was written by an earlier version" in message
+    assert "this run cannot be resumed: an earlier version wrote it" in message
     assert "--init" in message
     assert path.read_bytes() == before
     again = [*small, "--output.name=again", f"--init={tmp_path / 'run' / 'latest.pt'}"]

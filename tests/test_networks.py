@@ -20,7 +20,7 @@ PAPER = {"heightmap", "item", "height", "mask"}
 
 
 def first_orientation(game: Packing, agent: str) -> Choice:
-    """Return what is chosen before the agent's turn: the first legal orientation, or nothing."""
+    """Return the choices before the agent's turn: the first legal orientation, or nothing."""
     return (game.orientation_mask.int().argmax(1),) if agent == "placement" else ()
 
 
@@ -155,7 +155,7 @@ def test_with_a_shortcut_the_heads_see_the_input_channels() -> None:
     assert torch.equal(features[:, 4:], channels)
 
 
-def test_feasible_cells_are_seen_beside_the_most_of_any_placement() -> None:
+def test_feasible_cells_are_observed_relative_to_the_best_placement() -> None:
     game = Packing(4, seed=1)
     for _ in range(8):
         game.place(*make_policy("dblf")(game))
@@ -194,7 +194,7 @@ def actor_and_critic(share: bool) -> tuple[Actor, Critic]:
     return actor, Critic({}, groups, "critic", 1, **arguments, **cnns)
 
 
-def test_a_critic_that_shares_the_trunk_sees_the_features_of_the_moment() -> None:
+def test_a_critic_that_shares_the_trunk_sees_the_current_features() -> None:
     actor, critic = actor_and_critic(share=True)
     first = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
     other = dict(first, item=first["item"] + 1)

@@ -24,14 +24,14 @@ def test_a_game_worked_by_hand() -> None:
     assert float(first.reward) == pytest.approx(2 * 32 / 64)
     assert not bool(first.done)
     assert game.items.sides.tolist() == [[2, 2, 2]]
-    # However the cube is turned, it has nine places.
+    # In each orientation the cube has nine places.
     assert game.mask[0].flatten(1).sum(1).tolist() == [9] * 6
     second = game.place(torch.tensor([5]), torch.tensor([0]))
     assert float(second.reward) == pytest.approx(2 * 8 / 64)
-    # Over the cube it would reach z = 5: only beside it, flat, is room. 2 x 4 x 1 fits on x = 2.
-    turned = game.orient(torch.tensor([1]))
-    assert turned.sides.tolist() == [[2, 4, 1]]
-    assert turned.mask[0].nonzero().tolist() == [[2, 0]]
+    # Over the cube it would reach z = 5, so it must lie flat beside it: 2 x 4 x 1 at x = 2.
+    oriented = game.orient(torch.tensor([1]))
+    assert oriented.sides.tolist() == [[2, 4, 1]]
+    assert oriented.mask[0].nonzero().tolist() == [[2, 0]]
     third = game.place(torch.tensor([1]), torch.tensor([2 * 4]))
     assert bool(third.done)
     assert float(third.utilization) == pytest.approx((32 + 8 + 8) / 64)
@@ -40,7 +40,7 @@ def test_a_game_worked_by_hand() -> None:
     assert not game.mask.any()
 
 
-def test_wasted_space_is_charged() -> None:
+def test_wasted_space_lowers_the_reward() -> None:
     game = Packing(1, (4, 2, 4), [[2, 2, 2], [3, 2, 1], [1, 1, 1]], auto_reset=False)
     game.place(torch.tensor([0]), torch.tensor([0]))
     outcome = game.place(torch.tensor([0]), torch.tensor([0]))  # 1 x 2 x 2 cells are enclosed
@@ -51,7 +51,7 @@ def test_wasted_space_is_charged() -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("size", [(10, 10, 10), (8, 5, 13)])
-def test_every_play_the_mask_allows_ends_with_an_item_that_has_no_place(
+def test_every_play_the_mask_allows_ends_with_an_item_without_a_legal_cell(
     rule: str, size: tuple[int, int, int]
 ) -> None:
     game = Packing(24, size, "rs", rule=rule, auto_reset=False, seed=1)
@@ -137,9 +137,9 @@ def test_orienting_changes_nothing() -> None:
     game = Packing(6, seed=6)
     before = game.bins.clone(), game.mask.clone(), game.items.sides.clone()
     for o in range(6):
-        turned = game.orient(torch.full((6,), o))
-        assert torch.equal(turned.sides, game.items.sides[:, list(ORIENTATIONS[o])])
-        assert torch.equal(turned.mask, game.mask[:, o])
+        oriented = game.orient(torch.full((6,), o))
+        assert torch.equal(oriented.sides, game.items.sides[:, list(ORIENTATIONS[o])])
+        assert torch.equal(oriented.mask, game.mask[:, o])
     for now, then in zip(game.bins.tensors(), before[0].tensors(), strict=True):
         assert torch.equal(now, then)
     assert torch.equal(game.mask, before[1])
@@ -171,11 +171,11 @@ def test_an_episode_that_cannot_begin_is_skipped_or_over() -> None:
     rows = [[[2, 2, 9]], [[3, 3, 3]], [[2, 9, 2]], [[4, 4, 4]]]
     arguments = {"bin": (9, 5, 5), "items": rows, "orientations": (0,)}
     game = Packing(1, **arguments)
-    seen = []
+    first_sides = []
     for _ in range(4):
-        seen.append(int(game.items.sides[0, 0]))
+        first_sides.append(int(game.items.sides[0, 0]))
         game.place(torch.tensor([0]), torch.tensor([0]))
-    assert seen == [3, 4, 3, 4]
+    assert first_sides == [3, 4, 3, 4]
     still = Packing(4, auto_reset=False, **arguments)
     assert still.alive.tolist() == [False, True, False, True]
     # A margin that some items can never meet does not stop a long run.
@@ -193,7 +193,7 @@ def test_orientations_that_are_not_allowed_have_no_cell() -> None:
         game.place(*policy(game))
 
 
-def test_weights_and_centres_of_mass_of_placed_boxes_are_kept() -> None:
+def test_weights_and_centres_of_mass_of_placed_boxes_are_stored() -> None:
     items = check_items([[2, 4, 6], [3, 3, 3]], (10, 10, 10), weights=[7.0, 1.5])
     game = Packing(1, items=items, com_offset=(0.25, 0.0, -0.25), auto_reset=False)
     assert float(game.items.weights) == 7.0
@@ -229,7 +229,7 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"rule": "area_ratio", "margin": 1}, "no parameter 'margin'"),
         ({"thresholds": "code"}, "no parameter 'thresholds'"),
         ({"thresholds": "codes"}, "thresholds = 'codes': one of paper, code"),
-        ({"rule": make_rule("hull_1"), "margin": 1}, "margin: goes with the name of a rule"),
+        ({"rule": make_rule("hull_1"), "margin": 1}, "margin: needs the name of a rule"),
         ({"mask_orientations": None}, "mask_orientations = None: needs true or false"),
         ({"max_items": 0}, "max_items = 0: needs a whole number ≥ 1"),
         ({"orientations": [0.9]}, "orientations"),
@@ -246,7 +246,7 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"bin": (4, 9, 9), "items": [[9, 2, 2]], "orientations": (0,)}, "no item that begins"),
     ],
 )
-def test_what_cannot_be_played_is_refused(arguments: dict[str, object], why: str) -> None:
+def test_impossible_games_are_refused(arguments: dict[str, object], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         Packing(**({"n": 2} | arguments))
 
@@ -279,7 +279,7 @@ def test_heuristics_choose_what_the_mask_allows(name: str) -> None:
         game.place(orientation, cell)
 
 
-def test_heuristics_take_the_place_their_rule_says() -> None:
+def test_heuristics_take_the_placement_of_their_rule() -> None:
     def choice(name: str, boxes: list[tuple[int, int, int, int]], item: list[int]) -> list[int]:
         """Set boxes (cell x, w, d, h) along x, then ask where the item goes: x, y, z and sides."""
         game = Packing(
@@ -296,7 +296,7 @@ def test_heuristics_take_the_place_their_rule_says() -> None:
     assert choice("dblf", step, [2, 2, 1]) == [4, 0, 0]
     # A 3-wide box fits no level floor. DBLF takes the lowest place that stands, x = 0 at z = 2? No:
     # at x = 0 its middle 1.5 is over the lower block, contact only at x = 2: it would tip. x = 1
-    # puts it over 2 … 4 with one column enclosed, x = 2 likewise with two more.
+    # puts it over 2 … 4 with one column enclosed, x = 2 would enclose two more.
     assert choice("dblf", step, [3, 2, 1]) == [1, 0, 2]
     # One column of depth 1 enclosed at x = 1 (waste 2), at x = 2 the floor below x = 4 (waste 4).
     assert choice("best_fit", step, [3, 2, 1]) == [1, 0, 2]
@@ -400,6 +400,6 @@ def test_a_state_of_other_games_is_refused_and_changes_nothing() -> None:
     state = game.state_dict()
     with pytest.raises(ValueError, match=r"another game: bins\.heightmap is \[3, 10, 10\]"):
         game.load_state_dict(other.state_dict())
-    with pytest.raises(ValueError, match="its items are not this game's"):
+    with pytest.raises(ValueError, match="needs the items of this game"):
         game.load_state_dict(Packing(2, items="cut1").state_dict())
     assert all(torch.equal(value, state[name]) for name, value in game.state_dict().items())

@@ -1,4 +1,4 @@
-"""Plans: what they refuse, what they say, and that files of them read back as they were."""
+"""Plans: refused values, their parts, and files that read back as they were written."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ NOTHING = Plan.of_boxes(BIN, [])
 ALL = (PLAIN, NAMED, MILLIMETRES, SEVERAL)
 
 
-def test_a_plan_says_what_its_boxes_are() -> None:
+def test_a_plan_holds_all_attributes_of_its_boxes() -> None:
     assert len(NAMED) == 2
     assert NAMED.boxes.tolist() == [list(row) for row in ROWS]
     assert NAMED.loads.tolist() == [[3.25, 2.5, 2.0], [0.1, 1.5, 1 / 3]]
@@ -81,7 +81,9 @@ def test_parts_of_a_plan_are_plans() -> None:
     ({"ids": (1, 2)}, "ids: needs one text"),
     ({"unit_mm": 0.0}, "unit_mm = 0.0: needs a positive length"),
 ])  # fmt: skip
-def test_what_cannot_be_is_refused_with_the_box_named(change: dict[str, object], why: str) -> None:
+def test_impossible_values_are_refused_with_the_box_named(
+    change: dict[str, object], why: str
+) -> None:
     with pytest.raises(ValueError, match=why):
         replace(PLAIN, **change)  # type: ignore[arg-type]  # bad ones are meant
 
@@ -109,7 +111,7 @@ def test_csv_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
     assert again.sides.dtype == plan.sides.dtype
 
 
-def test_a_line_of_csv_says_all_that_a_robot_needs(tmp_path: Path) -> None:
+def test_a_line_of_csv_holds_everything_about_its_box(tmp_path: Path) -> None:
     path = tmp_path / "plan.csv"
     SEVERAL.to_csv(path)
     header, first, *_ = path.read_text().splitlines()
@@ -186,7 +188,7 @@ def test_no_plans_make_no_archive(tmp_path: Path) -> None:
         save_plans(tmp_path / "plans.npz", [])
 
 
-def test_archives_of_before_are_read(tmp_path: Path) -> None:
+def test_older_archives_are_read(tmp_path: Path) -> None:
     path = tmp_path / "stacks.npz"
     boxes = np.zeros((2, 2, 6), np.int16)
     boxes[0], boxes[1, 0] = ROWS, ROWS[0]
@@ -209,7 +211,7 @@ def test_a_foreign_archive_is_refused(tmp_path: Path) -> None:
         load_plans(tmp_path / "nowhere.npz")
 
 
-def test_an_archive_whose_arrays_do_not_go_together_is_refused(tmp_path: Path) -> None:
+def test_an_archive_of_mismatched_arrays_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     good = {"bin": np.array(BIN), "count": np.array([1]), "boxes": np.array([ROWS[:1]]),
             "loads": np.array([[(32.0, 2, 2)]]), "utilization": np.array([0.032])}  # fmt: skip
@@ -220,14 +222,14 @@ def test_an_archive_whose_arrays_do_not_go_together_is_refused(tmp_path: Path) -
                         ("orientations", [1]), ("unit_mm", [1.0, 1.0]),
                         ("bin", [[(10, 10, 10)]] * 2)):  # fmt: skip
         np.savez(path, **{**good, name: np.array(value)})
-        with pytest.raises(ValueError, match="do not go together"):
+        with pytest.raises(ValueError, match="needs arrays of matching shapes"):
             load_plans(path)
     np.savez(path, **{**good, "boxes": np.array([[(9, 0, 0, 2, 2, 2)]])})
     with pytest.raises(ValueError, match=r"episode 0: box 0 .*: reaches out"):
         load_plans(path)
 
 
-def test_a_plan_of_a_game_is_what_stands_in_its_bin() -> None:
+def test_a_plan_of_a_game_holds_the_boxes_in_its_bin() -> None:
     game = Packing(3, seed=1, com_offset=(0.1, 0, 0), auto_reset=False)
     policy = make_policy("dblf")
     while bool(game.alive.any()):
@@ -243,7 +245,7 @@ def test_a_plan_of_a_game_is_what_stands_in_its_bin() -> None:
 
 
 class Labelled:
-    """A state of one bin that knows which items its boxes are."""
+    """A state of one bin whose boxes have labels."""
 
     size = BIN
     count = torch.tensor([2])

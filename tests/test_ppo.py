@@ -79,7 +79,7 @@ def test_advantages_are_those_worked_by_hand() -> None:
         assert torch.allclose(storage.advantages[:, 0, 0], normal)
 
 
-def test_the_value_after_a_rollout_is_that_of_a_drawn_orientation_and_nothing_moves() -> None:
+def test_the_value_after_a_rollout_is_that_of_a_drawn_orientation_and_the_game_stays() -> None:
     runner = make_runner(tiny(), None)
     before = runner.env.game.state_dict()
     last = {}
@@ -144,9 +144,7 @@ def played(config: Config, policy: Policy) -> float:
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_the_trainer_learns_to_pack_a_tiny_bin_as_well_as_can_be(
-    joint: bool, tmp_path: Path
-) -> None:
+def test_the_trainer_learns_to_pack_a_tiny_bin_optimally(joint: bool, tmp_path: Path) -> None:
     """Ten boxes of 3 × 2 × 1 are the most that 4 × 4 × 4 holds; random play places eight."""
     path = tmp_path / "items.json"
     path.write_text(json.dumps({"bin": [4, 4, 4], "items": [[3, 2, 1]] * 12}))
@@ -227,7 +225,7 @@ def test_a_run_with_a_frozen_network_resumes_without_the_old_file(tmp_path: Path
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
-    """Else the KL that the adaptive schedule sees is huge, and the learning rate collapses."""
+    """Otherwise the KL would be huge, and the adaptive learning rate would collapse."""
     config = tiny("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--ppo.desired_kl=0.02",
                   f"--joint={str(joint).lower()}")  # fmt: skip
     runner = make_runner(config, None)

@@ -1,4 +1,4 @@
-"""The examples of the README and of the docs run as they stand."""
+"""The examples of the README and of the docs run without changes."""
 
 import re
 from pathlib import Path

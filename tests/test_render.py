@@ -19,14 +19,14 @@ EMPTY = np.zeros((0, 6), dtype=np.int16)
 
 
 def disjoint(rng, size, tries=60):
-    """Random boxes, floating where they happen to be, that do not overlap."""
-    taken = np.zeros(size, dtype=bool)
+    """Random boxes that float and do not overlap."""
+    filled = np.zeros(size, dtype=bool)
     boxes = []
     for _ in range(tries):
         sides = rng.integers(1, np.array(size) * 2 // 3 + 1)
         x, y, z = (int(rng.integers(0, size[k] - sides[k] + 1)) for k in range(3))
         w, d, h = sides.tolist()
-        cells = taken[x : x + w, y : y + d, z : z + h]
+        cells = filled[x : x + w, y : y + d, z : z + h]
         if not cells.any():
             cells[:] = True
             boxes.append((x, y, z, w, d, h))
@@ -34,7 +34,7 @@ def disjoint(rng, size, tries=60):
 
 
 def stacked(rng, size, n):
-    """Random boxes lowered one on another."""
+    """Random boxes stacked one on another."""
     tops = np.zeros(size[:2], dtype=int)
     boxes = []
     while len(boxes) < n:
@@ -72,8 +72,8 @@ def assert_painted_right(boxes, size, rng, n=400):
     strokes[:, 2] = level
     painted = met(rays, strokes) > -np.inf
     last = len(order) - 1 - painted[:, ::-1].argmax(1)
-    shown = np.where(painted.any(1), np.array([i for i, _ in order])[last], -1)
-    np.testing.assert_array_equal(shown, nearest)
+    painted_last = np.where(painted.any(1), np.array([i for i, _ in order])[last], -1)
+    np.testing.assert_array_equal(painted_last, nearest)
 
 
 @pytest.mark.parametrize("size", [SIZE, (20, 10, 12), (6, 30, 9)])
@@ -127,7 +127,7 @@ def test_in_the_plain_case_each_box_is_painted_once_from_the_back_corner_to_the_
     assert grid[order[-1][0]][:3] == (2, 0, 2)
 
 
-def test_a_box_behind_another_leaves_no_trace():
+def test_a_box_behind_another_is_invisible():
     front = (3, 0, 0, 6, 1, 9)
     first, second = (
         draw(SIZE, np.array([hidden, front])) for hidden in [(4, 2, 0, 1, 1, 2), (5, 3, 0, 1, 1, 1)]
@@ -144,7 +144,7 @@ def test_a_picture_has_the_pixels_asked_for_and_draws_on_no_global_figure():
     assert pyplot is None or not pyplot.get_fignums()
 
 
-def test_what_is_drawn_shows():
+def test_each_argument_changes_the_picture():
     boxes = np.array([(0, 0, 0, 5, 5, 5), (5, 0, 0, 5, 5, 5)])
     masks = np.zeros((6, 10, 10), dtype=bool)
     legal = masks.copy()
@@ -210,6 +210,6 @@ def test_a_saved_picture_reads_back_as_it_was(tmp_path):
         ({"pixels": (0, 10)}, "at least one column"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_with_what_would_be_right(change, words):
+def test_impossible_arguments_are_refused_with_what_would_be_right(change, words):
     with pytest.raises(ValueError, match=words):
         draw(**{"size": SIZE, "boxes": EMPTY} | change)

@@ -1,4 +1,4 @@
-"""The judge: stacks whose fate is known, what collides with what, what is refused."""
+"""The judge: stacks with a known verdict, collisions, and refused stacks and options."""
 
 import json
 import re
@@ -63,14 +63,14 @@ def stack(*boxes: tuple[float, ...], **named: object) -> Stack:
     ([(0, 0, 0, 1, 1)], {}, r"needs \[n, 6\]"),
     ([FLAT], {"density": 1e308, "cell": 100.0}, r"box 0 .*: its mass is not a number > 0"),
 ])  # fmt: skip
-def test_a_stack_that_cannot_be_is_refused_with_the_box_named(
+def test_an_impossible_stack_is_refused_with_the_box_named(
     boxes: list[tuple[float, ...]], named: dict[str, object], why: str
 ) -> None:
     with pytest.raises(ValueError, match=why):
         stack(*boxes, **named)
 
 
-def test_the_bin_itself_must_be_one() -> None:
+def test_an_impossible_bin_is_refused() -> None:
     with pytest.raises(ValueError, match="three positive numbers"):
         Stack.of_cells((1, 2, 0), [FLAT], density=1.0)
 
@@ -126,7 +126,7 @@ def random_stack(seed: int, rule: str = "none") -> Stack:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_rests_on_another_collides_with_it_and_no_neighbour_does(seed: int) -> None:
+def test_a_box_collides_with_the_boxes_below_it_and_no_neighbour(seed: int) -> None:
     pile = random_stack(seed)
     assert len(pile) > 20
     groups = np.array(collision_groups(pile, Physics()), np.int64)
@@ -156,14 +156,14 @@ def test_a_control_is_judged_right_a_fifth_of_a_millimetre_from_tipping(
 
 
 @pytest.mark.parametrize("name", controls.STANDING)
-def test_what_stands_with_room_to_spare_stands(name: str) -> None:
+def test_stacks_with_a_large_margin_stand(name: str) -> None:
     verdict = check(Stack.of_plan(controls.STANDING[name]()))
     assert verdict.stands
     assert verdict.passes == 1
     assert verdict.distance.max() < 1e-3
 
 
-def test_a_verdict_says_what_moved_and_how_far() -> None:
+def test_a_verdict_reports_which_boxes_moved_and_how_far() -> None:
     pile = stack(FLAT, (6, 6, 0, 2, 2, 2), (2, 0, 2, 5, 4, 1))  # its middle 0.5 cells over the edge
     verdict = check(pile)
     assert not verdict.stands
@@ -181,7 +181,7 @@ def test_judging_ends_at_the_first_fall() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_judging_only_what_hangs_together_with_the_last_box_finds_what_judging_all_does(
+def test_judging_only_boxes_connected_to_the_last_gives_the_verdict_on_all(
     seed: int,
 ) -> None:
     pile = random_stack(seed, "none")
@@ -192,27 +192,27 @@ def test_judging_only_what_hangs_together_with_the_last_box_finds_what_judging_a
         assert verdict.distance.shape == verdict.angle.shape == (count,)
 
 
-def test_where_all_boxes_collide_a_neighbour_props_up_what_falls() -> None:
+def test_if_all_boxes_collide_a_neighbour_props_up_a_falling_box() -> None:
     pile = Stack.of_plan(controls.propped(0.0, 100.0, -5.0))
     assert not check(pile).stands
     assert check(pile, Physics(everything=True)).stands
 
 
-def test_walls_hold_where_they_collide() -> None:
-    """A plate that tips off its post, with room around it or just as wide as the bin."""
+def test_walls_hold_boxes_that_collide_with_them() -> None:
+    """A plate that tips off its post, with walls far away or close to it."""
     boxes = np.array([(0, 0, 0, 40, 50, 50), (0, 0, 50, 99, 50, 5)])
-    room = Stack.of_cells(
+    wide = Stack.of_cells(
         (200, 200, 100), boxes + np.array((50, 70, 0, 0, 0, 0)), cell=0.005, density=500.0
     )
     tight = Stack.of_cells((200, 50, 100), boxes, cell=0.005, density=500.0)
-    assert not check(room, Physics(everything=True)).stands
+    assert not check(wide, Physics(everything=True)).stands
     assert not check(tight).stands
     assert check(tight, Physics(everything=True)).stands
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
 @pytest.mark.parametrize("cell", [1e-4, 0.06, 4.0])
-def test_a_verdict_knows_no_unit_of_mass_or_length(unit: float, cell: float) -> None:
+def test_a_verdict_does_not_depend_on_units_of_mass_and_length(unit: float, cell: float) -> None:
     for far, stands in ((2, False), (1, True)):
         pile = Stack.of_cells(BIN, [FLAT, (far, 0, 2, 5, 4, 1)], cell=cell, mass=unit)
         assert check(pile).stands == stands
@@ -227,7 +227,7 @@ def test_heavy_boxes_on_light_ones_stand() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_judge_agrees_with_the_exact_equilibrium_on_random_stacks(seed: int) -> None:
-    """The first stack of each bin that statics calls unstable, and the one before it."""
+    """The first stack of each bin that is not in equilibrium, and the one before it."""
     pile = random_stack(seed, "hull_1" if seed % 2 else "none")
     rng = np.random.default_rng(seed)
     bodies = replace(
@@ -251,7 +251,7 @@ def test_a_centre_of_mass_decides() -> None:
     assert check(balanced).stands
 
 
-def test_several_processes_judge_alike() -> None:
+def test_several_processes_give_the_same_verdicts() -> None:
     piles = [stack(FLAT, (2, 0, 2, 5, 4, 1)), stack(FLAT), stack(FLAT, (0, 0, 2, 4, 4, 1))]
     alone = list(judge_all(piles))
     both = list(judge_all(piles, processes=2))
@@ -290,7 +290,7 @@ def test_bodies_are_drawn_within_their_bounds_and_the_same_again(tmp_path: Path)
     {"density": (0.0, 1.0)}, {"density": (2.0, 1.0)}, {"com_spread": 0.5}, {"com_spread": -0.1},
     {"seed": -1}, {"density": (1.0, float("inf"))},
 ])  # fmt: skip
-def test_bodies_that_cannot_be_are_refused(named: dict[str, object]) -> None:
+def test_impossible_bodies_are_refused(named: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="needs"):
         Bodies(**named)  # type: ignore[arg-type]  # bad ones are meant
 
@@ -324,8 +324,8 @@ def test_saved_stacks_are_judged_and_drawn(
         capsys.readouterr().out.split()
     )
     picture = tmp_path / "s.png"
-    shown = ["stack", str(path), "--episodes", str(fall["episode"]), "--render", str(picture)]
-    assert main(shown) == 0
+    command = ["stack", str(path), "--episodes", str(fall["episode"]), "--render", str(picture)]
+    assert main(command) == 0
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".npz", ".png"]
 
@@ -338,7 +338,7 @@ def test_saved_stacks_are_judged_and_drawn(
     ("controls --friction nan", "friction = nan"),
     ("table1 --json nowhere/x.json", "does not exist"),
 ])  # fmt: skip
-def test_what_the_command_cannot_do_is_refused(
+def test_impossible_options_are_refused(
     arguments: str, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments.split()) == 2
@@ -361,9 +361,9 @@ def test_table1_does_not_depend_on_the_processes_and_counts_falls(
     assert rows[0]["none"]["falls"] > 0
     assert rows[0]["none"]["falls"] == rows[0]["none"]["falls_unstable"]
     assert rows[0]["hull_alpha"]["falls"] == 0
-    shown = capsys.readouterr().out
-    assert "hull_alpha, paper" in shown
-    assert "hull_1, paper" not in shown  # it is not asked for
+    output = capsys.readouterr().out
+    assert "hull_alpha, paper" in output
+    assert "hull_1, paper" not in output  # it is not asked for
     plans = load_plans(tmp_path / "falls_none.npz")
     assert len(plans) == rows[0]["none"]["falls"]
     assert all(plan.unit_mm == 1000 * table1.CELL for plan in plans)
@@ -380,14 +380,14 @@ def test_a_film_shows_the_fall(tmp_path: Path) -> None:
     assert frames[-1].middles[2, 2] == pytest.approx(0.05, abs=0.01)  # the heavy one is down
     path = tmp_path / "fall.gif"
     assert film.render(pile, path, "falls").moved
-    shown = imageio.mimread(path)
+    pictures = imageio.mimread(path)
     falling = sum(
         len(a.middles) == len(b.middles) and np.abs(b.middles - a.middles).max() > 0.002
         for a, b in pairwise(frames)
     )
     assert falling > 8
-    assert falling < len(shown) < len(frames)  # frames in which nothing moves are one
-    assert np.any(shown[0] != shown[-1])
+    assert falling < len(pictures) < len(frames)  # frames in which nothing moves are one
+    assert np.any(pictures[0] != pictures[-1])
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4"):
         film.render(pile, tmp_path / "fall.avi")
     with pytest.raises(ValueError, match="no boxes"):
@@ -414,7 +414,7 @@ def test_a_plan_becomes_a_stack_in_its_own_unit() -> None:
 def test_a_plan_of_several_bins_is_judged_bin_by_bin() -> None:
     plan = Plan.of_boxes(BIN, [FLAT, (0, 0, 0, 2, 2, 2)][:1])
     plan = replace(plan, bin_sizes=np.array([BIN, BIN]))
-    with pytest.raises(ValueError, match=r"2 bins: judge each, plan\.in_bin\(k\)"):
+    with pytest.raises(ValueError, match=r"2 bins: needs one, plan\.in_bin\(k\)"):
         Stack.of_plan(plan)
     assert [len(Stack.of_plan(plan.in_bin(k))) for k in (0, 1)] == [1, 0]
 
@@ -441,7 +441,7 @@ def test_an_episode_is_named_with_its_box(
     assert "episode 1: box 1 (0, 0, 0, 4, 4, 2) overlaps box 0" in capsys.readouterr().err
 
 
-def test_without_sapien_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sapien_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
     from marl_pack.sapien_check.world import load_sapien

@@ -43,7 +43,7 @@ def utilization(policy: Policy, episodes: int = 24) -> float:
     return float(play(policy, game, episodes).utilization.mean())
 
 
-def test_a_branch_plays_on_like_the_game_it_comes_from() -> None:
+def test_a_branch_continues_like_the_game_it_comes_from() -> None:
     policy = make_policy("dblf")
     whole = game(5)
     for _ in range(6):
@@ -79,7 +79,7 @@ def test_searching_beats_the_same_agents_without(agents: Agents) -> None:
     assert utilization(planner) > utilization(alone) + 0.03
 
 
-def test_a_critic_may_value_what_comes_after_a_depth(agents: Agents) -> None:
+def test_a_critic_may_value_the_rest_after_a_depth(agents: Agents) -> None:
     batches: list[int] = []
 
     class FlatTops(torch.nn.Module):
@@ -103,7 +103,7 @@ def test_a_decision_does_not_depend_on_the_batch(agents: Agents) -> None:
         assert torch.equal(torch.stack(planner(game(1, i)), 1)[0], chosen[i])
 
 
-def test_pairs_share_their_futures_and_no_future_is_what_comes(
+def test_pairs_share_their_futures_and_no_future_is_the_real_one(
     agents: Agents, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     branches: list[Packing] = []

@@ -133,7 +133,7 @@ def test_stacks_built_under_a_sound_rule_stand_as_a_whole(rule: str) -> None:
         assert all(in_equilibrium(boxes_of(bins, b)) for b in range(40))
 
 
-def test_stacks_built_under_hull_1_often_do_not() -> None:
+def test_stacks_built_under_hull_1_often_do_not_stand() -> None:
     bins = random_play(hull_1, 100, (10, 10, 10), (2, 5), 20, seed=12)
     share = np.mean([in_equilibrium(boxes_of(bins, b)) for b in range(100)])
     assert 0.5 < share < 0.99
@@ -226,21 +226,21 @@ def test_reduced_equilibrium_equals_the_linear_program_on_tall_stacks(
     ("name", "size", "verdict"),
     [("falls", (12, 9, 400), False), ("stands", (120, 120, 240), True)],
 )
-def test_stacks_that_try_the_simplex_hard(
+def test_the_simplex_solves_deep_degenerate_stacks(
     name: str, size: tuple[int, int, int], verdict: bool
 ) -> None:
-    # Eighty and forty boxes deep: most pivots are degenerate, and small ones spoil the numbers.
+    # Eighty and forty boxes deep: most pivots are degenerate, and small ones make large errors.
     with np.load(Path(__file__).parent / "data" / "hard_stacks.npz") as archive:
         boxes = archive[name]
-    heights, gaps = np.zeros(size[:2], int), np.zeros(size[:2], int)
+    heights, empty_map = np.zeros(size[:2], int), np.zeros(size[:2], int)
     for x, y, _, w, d, h in boxes[:-1].tolist():
-        reference.place_box(heights, gaps, (x, y), (w, d, h))
+        reference.place_box(heights, empty_map, (x, y), (w, d, h))
     last = boxes[-1]
-    mask = stable_mask("equilibrium", heights, gaps, last[3:], size[2], boxes[:-1])
+    mask = stable_mask("equilibrium", heights, empty_map, last[3:], size[2], boxes[:-1])
     assert mask[last[0], last[1]] == in_equilibrium(boxes) == verdict
 
 
-def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_highs_decides_where_the_simplex_is_unsure(monkeypatch: pytest.MonkeyPatch) -> None:
     bins = random_play(hull_alpha, 6, (7, 7, 12), (1, 5), 12, seed=32)
     item = orient_item(some_items(6, (1, 5), 33))
     expected_mask = equilibrium(bins, item)
@@ -253,22 +253,22 @@ def test_what_the_simplex_is_unsure_of_goes_to_the_library(monkeypatch: pytest.M
     assert torch.equal(equilibrium(bins, item), expected_mask)
 
 
-def test_equilibrium_with_a_margin_asks_for_every_place_of_the_centre() -> None:
+def test_equilibrium_with_a_margin_needs_every_position_of_the_centre() -> None:
     bins = random_play(hull_alpha, 60, (7, 7, 12), (1, 5), 16, seed=18)
     item = orient_item(some_items(60, (1, 5), 19))
-    free, kept = equilibrium(bins, item), equilibrium(bins, item, margin=0.4)
-    assert not (kept & ~free).any()
-    assert kept.sum() < free.sum()
+    free, strict = equilibrium(bins, item), equilibrium(bins, item, margin=0.4)
+    assert not (strict & ~free).any()
+    assert strict.sum() < free.sum()
     for dx, dy in ((0.4, 0), (-0.4, 0), (0, 0.4), (0, -0.4), (0.28, -0.28)):
         moved = OrientedItem(item.sides, item.centres() + torch.tensor([dx, dy]))
-        assert not (kept & ~equilibrium(bins, moved)).any()
+        assert not (strict & ~equilibrium(bins, moved)).any()
 
 
 # --- symmetry and independence --------------------------------------------------------------------
 
 
 def mirrored(bins: Bins) -> Bins:
-    """The bins with x turned round."""
+    """The bins mirrored along x."""
     boxes, loads = bins.boxes.clone(), bins.loads.clone()
     width = bins.size[0]
     boxes[..., 0] = width - boxes[..., 0] - boxes[..., 3]
@@ -291,10 +291,10 @@ def test_masks_follow_the_bins_symmetries(rule: str) -> None:
     bins = random_play(hull_alpha, 30, (8, 6, 12), (1, 5), 14, seed=20)
     item = orient_item(some_items(30, (1, 5), 21))
     mask = bound(bins, item)
-    turned = bound(mirrored(bins), item)
+    reflected = bound(mirrored(bins), item)
     for b, a, x, y in mask.nonzero().tolist():
-        assert turned[b, a, 8 - x - int(item.sides[b, a, 0]), y]
-    assert mask.sum() == turned.sum()
+        assert reflected[b, a, 8 - x - int(item.sides[b, a, 0]), y]
+    assert mask.sum() == reflected.sum()
     # Exchanging x and y exchanges the orientations o and o ^ 1.
     swapped = bound(transposed(bins), item)
     assert torch.equal(swapped[:, [1, 0, 3, 2, 5, 4]].transpose(2, 3), mask)
@@ -311,7 +311,7 @@ def test_a_bins_mask_does_not_depend_on_the_others(rule: str) -> None:
         assert torch.equal(bound(bins[alone], item[alone])[0], together[b])
 
 
-def test_candidates_with_a_zero_side_have_no_cell() -> None:
+def test_orientations_with_a_zero_side_have_no_cell() -> None:
     bins = random_play(hull_alpha, 8, (6, 6, 9), (1, 4), 6, seed=24)
     for rule in RULES:
         for axis in range(3):

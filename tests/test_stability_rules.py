@@ -1,4 +1,4 @@
-"""Drawn cases that can be checked by hand, and errors at the door."""
+"""Small cases that can be checked by hand, and refused arguments."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def ask(rule: str, bins: Bins, item: tuple[int, int, int], **parameters: object)
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_on_the_floor_everything_that_fits_stands(rule: str) -> None:
+def test_on_the_floor_every_box_inside_the_bin_stands(rule: str) -> None:
     mask = ask(rule, stack((5, 4, 6)), (3, 2, 6))
     assert mask.sum() == 3 * 3
     assert mask[:3, :3].all()
@@ -216,7 +216,7 @@ def test_equilibrium_does_not_trust_a_stack_that_already_falls() -> None:
     assert mask[:, 0].tolist() == [True, False, False, False, False, False]
 
 
-def test_a_bound_rule_is_asked_as_carefully_as_a_named_one() -> None:
+def test_a_bound_rule_is_checked_like_a_named_one() -> None:
     boxes = np.array([(0, 0, 0, 1, 4, 2), (0, 0, 2, 5, 4, 1)])  # falls
     heights, gaps = np.zeros((6, 4), int), np.zeros((6, 4), int)
     heights[:5], gaps[1:5] = 3, 2
@@ -225,7 +225,7 @@ def test_a_bound_rule_is_asked_as_carefully_as_a_named_one() -> None:
     for name in ("lbcp", "equilibrium"):
         with pytest.raises(ValueError, match="give boxes"):
             stable_mask(make_rule(name), heights, gaps, (1, 1, 1), 8)
-    with pytest.raises(ValueError, match="go with the name of a rule"):
+    with pytest.raises(ValueError, match="need the name of a rule"):
         stable_mask(make_rule("hull_1"), heights, gaps, (1, 1, 1), 8, margin=1.0)
 
 
@@ -250,11 +250,11 @@ def test_a_bound_rule_is_asked_as_carefully_as_a_named_one() -> None:
         ({"weight": -2.0}, "weight"),
         ({"boxes": [[0, 0, 1, 1, 1, 1]]}, "row 0 .*floats"),
         ({"boxes": [[0, 0, 0, 3, 1, 1]]}, "row 0 .*outside"),
-        ({"boxes": [[0, 0, 0, 1, 1, 1]]}, "do not make this heightmap"),
+        ({"boxes": [[0, 0, 0, 1, 1, 1]]}, "need to make this heightmap"),
         ({"weights": [1.0]}, "weights"),
     ],
 )
-def test_what_cannot_be_is_refused(change: dict[str, object], why: str) -> None:
+def test_impossible_arguments_are_refused(change: dict[str, object], why: str) -> None:
     arguments: dict[str, object] = {
         "rule": "hull_alpha",
         "heightmap": np.zeros((2, 2)),
@@ -267,7 +267,7 @@ def test_what_cannot_be_is_refused(change: dict[str, object], why: str) -> None:
 
 
 @pytest.mark.parametrize("rule", ["lbcp", "equilibrium"])
-def test_rules_of_the_whole_stack_ask_for_it(rule: str) -> None:
+def test_rules_of_the_whole_stack_need_its_boxes(rule: str) -> None:
     with pytest.raises(ValueError, match="give boxes"):
         stable_mask(rule, np.ones((2, 2)), np.zeros((2, 2)), (1, 1, 1), 6)
 

@@ -1,4 +1,4 @@
-"""Augmentation by the bin's symmetries: transformed play is play in the transformed bin."""
+"""Augmentation by the bin's symmetries: mirrored play is play in the mirrored bin."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The command that trains: stopping, resuming, several processes, what it writes."""
+"""The command that trains: stopping, resuming, several processes and its files."""
 
 import csv
 import json
@@ -78,9 +78,9 @@ def test_a_run_leaves_settings_checkpoints_logs_and_history(
         if best["items"] == int(rows[-1]["items"])
         else float(rows[0]["utilization"])
     )
-    shown = capsys.readouterr().out
-    assert "items/s" in shown
-    assert "evaluation after 4 iterations, 128 items" in shown
+    output = capsys.readouterr().out
+    assert "items/s" in output
+    assert "evaluation after 4 iterations, 128 items" in output
     again = main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"])
     assert again == 2
     assert "--resume" in capsys.readouterr().err
@@ -133,7 +133,7 @@ def test_an_interrupt_ends_with_a_checkpoint(tmp_path: Path) -> None:
     assert checkpoints.read(run / "latest.pt")["iter"] >= 2
 
 
-def test_a_run_may_be_made_longer_but_not_another(
+def test_a_resumed_run_may_be_longer_but_not_different(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*SMALL, "--ppo.max_iterations=2", f"--output.folder={tmp_path}"]) == 0
@@ -154,7 +154,7 @@ def test_a_run_may_be_made_longer_but_not_another(
 def test_weights_and_biases_get_the_settings_and_the_scalars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a stand-in for the package, which needs an account."""
+    """A fake module replaces the package, which needs a user's login."""
     from rsl_rl.utils import wandb_log_writer
 
     logged: dict[str, object] = {}
@@ -206,7 +206,7 @@ def test_a_run_uses_no_folder_with_files_and_leaves_none_that_it_did_not_use(
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "notes.txt").write_text("mine")
     assert main([*SMALL, f"--output.folder={tmp_path}"]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     other = [*SMALL, f"--output.folder={tmp_path}", "--output.name=other"]
     assert main([*other, "--placement.frozen=true", "--placement.policy=nobody"]) == 2
     assert main([*other, "--device=meta"]) == 2
@@ -252,7 +252,7 @@ def test_a_run_begins_with_the_weights_of_another(
 
 
 def test_a_run_can_be_resumed_from_its_very_start(tmp_path: Path) -> None:
-    """A checkpoint is there before the first iteration; after resuming it has new settings."""
+    """The first checkpoint precedes the first iteration; resuming gives it new settings."""
     starts: list[int] = []
 
     class StoppedError(Exception):
@@ -301,7 +301,7 @@ def test_a_run_is_not_resumed_with_a_changed_file_of_items(
             options = [*SMALL, f"--game.items={items}", "--ppo.max_iterations=2"]
             assert main([*options, f"--output.folder={tmp_path}"]) == 0
     assert main(["--resume", str(tmp_path / "run"), "--ppo.max_iterations=3"]) == 2
-    assert "a changed file?" in capsys.readouterr().err
+    assert "was their file changed?" in capsys.readouterr().err
 
 
 def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Path) -> None:
@@ -325,9 +325,9 @@ def test_two_processes_learn_the_same_weights_from_different_items(tmp_path: Pat
     options = [*SMALL, *VALUES, "--ppo.max_iterations=3", f"--output.folder={tmp_path}"]
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2",
                 f"--master_port={port}", str(script)]  # fmt: skip
-    done = subprocess.run([*torchrun, *options], env=environment, capture_output=True, text=True,
+    both = subprocess.run([*torchrun, *options], env=environment, capture_output=True, text=True,
                           timeout=300)  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert both.returncode == 0, both.stdout + both.stderr
     ranks = [torch.load(tmp_path / f"rank{rank}", weights_only=True) for rank in (0, 1)]
     assert not torch.equal(ranks[0]["items"], ranks[1]["items"])
     for agent, state in ranks[0]["weights"]["learners"].items():

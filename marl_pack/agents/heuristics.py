@@ -1,7 +1,7 @@
-"""Heuristics: each scores every legal (orientation, cell) and takes the least.
+"""Heuristics, each of which scores every legal placement and takes the lowest score.
 
-All play on the same masks as the learned agents, so their packings are as stable. What is still
-equal after a heuristic's own keys goes to the first orientation, then to the first cell.
+All use the same masks as the learned agents, so their packings are as stable. If the keys of two
+placements are equal, the first orientation is taken, then the first cell.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from marl_pack.game.packing import Packing
 from marl_pack.geometry import resting_heights_and_waste
 
 Keys = Sequence[tuple[Tensor, int]]
-"""Whole numbers broadcastable to [G, 6, W, D], each with a bound that it stays below; the first key
+"""Whole numbers broadcastable to [G, 6, W, D], each with a bound that is larger; the first key
 decides, the next ones break ties."""
 
 
@@ -56,7 +56,7 @@ class Candidates:
 
     @cached_property
     def _both(self) -> tuple[Tensor, Tensor]:
-        """Resting heights and wasted cells."""
+        """Resting heights and wasted cells of every placement, computed together."""
         return self._windows(waste=True)
 
     @cached_property
@@ -84,7 +84,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Heuristic:
-    """A policy that takes the legal placement with the least keys.
+    """A policy that takes the legal placement with the lowest keys.
 
     Args:
         keys: the placements' keys.
@@ -99,7 +99,7 @@ class Heuristic:
 
         Args:
             game: the games.
-            legal: what may be chosen; all that is legal by default.
+            legal: the moves to choose among; all legal ones by default.
             lookahead: what placements leave; computed if not given.
         """
         rank = torch.zeros_like(game.mask, dtype=torch.int64)
@@ -116,8 +116,8 @@ def _dblf(c: Candidates) -> Keys:
 def _height_min(c: Candidates) -> Keys:
     """Heightmap minimisation (Wang & Hauser 2021): least c · (x + y) + sum of the new heightmap.
 
-    With c small, as they have it: the sum decides, x + y breaks ties. Since the item's volume is
-    given, the sum is least where least space is enclosed.
+    With a small c, as in the paper, the sum decides and x + y breaks ties. As the item's volume is
+    the same everywhere, the sum is least where least space is enclosed.
     """
     width, depth, height = c.size
     return (c.waste, width * depth * height), (c.x + c.y, width + depth)
@@ -130,10 +130,10 @@ def _best_fit(c: Candidates) -> Keys:
 
 
 def _max_feasible(c: Candidates) -> Keys:
-    """Most room for what may come: see :meth:`Lookahead.feasible_cells`.
+    """Most feasible cells afterwards (:meth:`Lookahead.feasible_cells`), then top, then x + y.
 
     Greatest mean number of cells where a box that may come next could be placed, then the lowest
-    top, then x + y.
+    top, then the lowest x + y.
     """
     width, depth, height = c.size
     most = width * depth * MOST_LENGTHS**3
@@ -190,10 +190,10 @@ def make_orientation_agent(
     device: torch.device | str = "cpu",
     lookahead: Lookahead | None = None,
 ) -> OrientationAgent:
-    """Return the first agent alone: ``random``, ``first`` or what a heuristic would choose.
+    """Return the orientation agent called ``name``: a heuristic, ``random`` or ``first``.
 
     ``first`` leaves the item as it comes (orientation 0), or takes the first orientation that may
-    be chosen where that has no place. Arguments as :func:`make_policy`; ``lookahead`` is shared
+    be chosen if orientation 0 may not. Arguments as :func:`make_policy`; ``lookahead`` is shared
     with the other agent.
 
     Raises:
@@ -216,7 +216,7 @@ def make_placement_agent(
     device: torch.device | str = "cpu",
     lookahead: Lookahead | None = None,
 ) -> PlacementAgent:
-    """Return the second agent alone: ``random``, or a heuristic among the cells that are left.
+    """Return the placement agent called ``name``: ``random``, or a heuristic in one orientation.
 
     Arguments as :func:`make_orientation_agent`.
 

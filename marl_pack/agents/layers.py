@@ -1,4 +1,4 @@
-"""Layers with the initial weights that PPO's actors and critics begin with."""
+"""Layers with the initial weights of PPO's actors and critics."""
 
 from __future__ import annotations
 

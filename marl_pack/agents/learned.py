@@ -1,4 +1,4 @@
-"""A trained network as an agent that plays."""
+"""An agent that plays by a trained network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marl_pack.game.packing import Packing
 
 
 class LearnedAgent:
-    """One agent's network, which takes its most probable action.
+    """A learned agent, which takes the most probable action of its network.
 
     Args:
         kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
@@ -31,7 +31,7 @@ class LearnedAgent:
         self.symmetric = symmetric
 
     def observe(self, game: Packing, *orientation: Tensor) -> Observation:
-        """Return what the agent observes; the placement agent once orientations are chosen."""
+        """Return what the agent observes; the placement agent needs the chosen orientations."""
         return observe(self.kind, game, self.actor.cnns.planes, self.lookahead, *orientation)
 
     def probabilities(self, observation: Observation) -> Tensor:

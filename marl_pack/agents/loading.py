@@ -1,4 +1,4 @@
-"""Agents and policies from names, runs' folders and checkpoints."""
+"""Load agents and policies by name, from runs' folders and from checkpoints."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ NAMES = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
 
 
 class Loader:
-    """Loads agents that play together: they share what is computed once a turn.
+    """A loader of agents that play together and share what is computed once a turn.
 
     Args:
         device: of the games.
         seed: of agents that play at random; None draws from torch's global generator.
         symmetric: whether learned agents are asked in all symmetries of the bin.
-        memo: which keeps what is computed once a turn.
+        memo: stores what is computed once a turn.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Loader:
         self.memo = memo or Memo()
         self._lookaheads: list[tuple[Mapping[str, Tensor] | None, Lookahead]] = []
 
-    # --- from what a user names -------------------------------------------------------------------
+    # --- by name or path --------------------------------------------------------------------------
 
     def policy(self, source: str) -> Policy:
         """Return the policy that ``source`` names.
@@ -75,10 +75,10 @@ class Loader:
         return self.policy_of(checkpoints.read(_path(source, POLICIES), self.device))
 
     def orientation_agent(self, source: str) -> OrientationAgent:
-        """Return the first agent: a heuristic's, a checkpoint's, or a joint agent's orientations.
+        """Return the orientation agent that ``source`` names; of a joint agent its orientations.
 
         Raises:
-            ValueError, FileNotFoundError: if there is none of that name.
+            ValueError, FileNotFoundError: if there is no such agent.
         """
         if source not in ORIENTATION_AGENTS:
             checkpoint = checkpoints.read(_path(source, ORIENTATION_AGENTS), self.device)
@@ -88,10 +88,14 @@ class Loader:
         return self.orientation_agent_of(record_of(source, ORIENTATION))
 
     def placement_agent(self, source: str) -> PlacementAgent:
-        """Return the second agent: a heuristic's, or a checkpoint's. Errors as above."""
+        """Return the placement agent that ``source`` names.
+
+        Raises:
+            ValueError, FileNotFoundError: if there is no such agent.
+        """
         return self.placement_agent_of(record_of(source, PLACEMENT))
 
-    # --- from what a checkpoint holds -------------------------------------------------------------
+    # --- from records and checkpoints -------------------------------------------------------------
 
     def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
         """Return the whole policy of a checkpoint, frozen agents included."""
@@ -104,21 +108,21 @@ class Loader:
         )
 
     def orientation_agent_of(self, record: Mapping[str, Any]) -> OrientationAgent:
-        """Return the first agent by its record."""
+        """Return the orientation agent of a record."""
         if "name" in record:
             lookahead = self._lookahead(record)
             return make_orientation_agent(record["name"], self.seed, self.device, lookahead)
         return self.learned(record, ORIENTATION)
 
     def placement_agent_of(self, record: Mapping[str, Any]) -> PlacementAgent:
-        """Return the second agent by its record."""
+        """Return the placement agent of a record."""
         if "name" in record:
             lookahead = self._lookahead(record)
             return make_placement_agent(record["name"], self.seed, self.device, lookahead)
         return self.learned(record, PLACEMENT)
 
     def agent_of(self, record: Mapping[str, Any], name: str) -> Callable[..., Tensor]:
-        """Return one of the two agents by its record."""
+        """Return the orientation or placement agent of a record, by the agent's name."""
         makers: dict[str, Callable[[Mapping[str, Any]], Callable[..., Tensor]]] = {
             ORIENTATION: self.orientation_agent_of,
             PLACEMENT: self.placement_agent_of,
@@ -126,10 +130,10 @@ class Loader:
         return makers[name](record)
 
     def learned(self, record: Mapping[str, Any], kind: str) -> LearnedAgent:
-        """Return a learned agent by its record.
+        """Return the learned agent of a record.
 
         Raises:
-            ValueError: if it is none, or its weights do not fit its network.
+            ValueError: if the agent has no network, or its weights do not match it.
         """
         actor = load_actor(record, kind, self.device)
         return LearnedAgent(kind, actor, self._lookahead(record), self.symmetric)
@@ -152,10 +156,10 @@ class Loader:
         Args:
             checkpoint: of a run.
             settings: how far to search.
-            futures: what may come.
+            futures: the stream from which future items are drawn.
 
         Raises:
-            ValueError: if not both agents are learned ones, or their critic cannot value a depth.
+            ValueError: unless both agents are learned, and their critic can value a depth if asked.
         """
         first, second = (
             self.learned(checkpoints.agent_record(checkpoint, name), name)
@@ -183,30 +187,39 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
         device: of the games.
 
     Raises:
-        ValueError: if it has not learned, or its weights do not fit its network.
+        ValueError: if the agent has no network, or its weights do not match it.
     """
     if "network" not in record:
         raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
     try:
-        with torch.random.fork_rng(devices=[]):  # fresh weights draw numbers that a run needs
+        with torch.random.fork_rng(devices=[]):  # a run's random numbers must stay
             actor = make_actor(kind, record["network"], device)
         actor.load_state_dict(record["actor_state_dict"])
     except (RuntimeError, TypeError, KeyError) as error:
-        raise ValueError(f"the {kind} agent's weights do not fit its network: {error}") from None
+        raise ValueError(f"the {kind} agent's weights do not match its network: {error}") from None
     return actor.eval()
 
 
 def load_critic(
     checkpoint: Mapping[str, Any], kind: str, device: torch.device | str, actor: Actor
 ) -> Critic:
-    """Return the critic of one agent of a run, beside its ``actor``. Else as :func:`load_actor`."""
+    """Return the critic of one agent of a run.
+
+    Args:
+        checkpoint: of the run.
+        kind, device: as for :func:`load_actor`.
+        actor: the agent's, whose trunk the critic may share.
+
+    Raises:
+        ValueError: if the agent has no critic, or its weights do not match its network.
+    """
     agent = checkpoint["agents"][kind]
     try:
         with torch.random.fork_rng(devices=[]):
             critic = make_critic(kind, agent["network"], device, actor)
         critic.load_state_dict(agent["critic_state_dict"])
     except (RuntimeError, KeyError) as error:
-        raise ValueError(f"the {kind} agent has no critic that fits: {error}") from None
+        raise ValueError(f"the {kind} agent has no matching critic: {error}") from None
     return critic.eval()
 
 
@@ -216,7 +229,7 @@ def load_afterstate_critic(
     """Return the critic of afterstates of a record or a checkpoint, None if it has none.
 
     Raises:
-        ValueError: if its weights do not fit.
+        ValueError: if the weights do not match the network.
     """
     weights = record.get("afterstate_critic")
     if weights is None:
@@ -226,12 +239,12 @@ def load_afterstate_critic(
     try:
         critic.load_state_dict(weights)
     except RuntimeError as error:
-        raise ValueError(f"the critic of afterstates does not fit: {error}") from None
+        raise ValueError(f"the critic of afterstates does not match: {error}") from None
     return critic.eval()
 
 
 def record_of(source: str, name: str) -> dict[str, Any]:
-    """Return the record of an agent that another run, or a heuristic, plays.
+    """Return the record of an agent of another run, or of a heuristic.
 
     Args:
         source: a heuristic's name, a run's folder or a checkpoint.
@@ -250,7 +263,7 @@ def record_of(source: str, name: str) -> dict[str, Any]:
 
 
 def trained_on(checkpoint: Mapping[str, Any]) -> str:
-    """Describe the game that a checkpoint's agents learned, and for how long."""
+    """Describe the game that a checkpoint's agents were trained on, and for how many items."""
     config = checkpoint["config"]
     game = config["game"]
     sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
@@ -264,11 +277,11 @@ def _path(source: str, names: Sequence[str]) -> Path:
     """Return ``source`` as a path.
 
     Raises:
-        ValueError, FileNotFoundError: if there is nothing there, naming what else it could be.
+        ValueError, FileNotFoundError: if it does not exist; names what would be right.
     """
     renamed.refuse_old(source, renamed.POLICIES, "policy")
     if not Path(source).exists():
         raise FileNotFoundError(
-            f"{source!r} is neither one of {', '.join(names)} nor a checkpoint or a run's folder"
+            f"{source!r}: needs one of {', '.join(names)}, a checkpoint or a run's folder"
         )
     return Path(source)

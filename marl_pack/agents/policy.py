@@ -1,4 +1,4 @@
-"""What every player is: a function from the game to an orientation and a cell for each game."""
+"""The interface of all players: a function from G games to an orientation and a cell for each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PlacementAgent = Callable[[Packing, Tensor], Tensor]
 
 
 def in_turns(orientation_agent: OrientationAgent, placement_agent: PlacementAgent) -> Policy:
-    """Return the policy of two agents, wherever each comes from."""
+    """Return the policy in which an orientation and a placement agent act in turns."""
 
     def play(game: Packing) -> Placement:
         orientation = orientation_agent(game)

@@ -1,11 +1,11 @@
-"""Search at decision time: the agents' best pairs, each played on in imagined futures.
+"""Search at decision time: try the agents' best pairs in imagined futures.
 
-The learned agents propose: of all legal pairs (orientation, cell) the M whose joint probability
-π_o(o) · π_p(cell | o) is highest; orientations that give the same box count as one. Each is then
-played in futures drawn from the known distribution of the items and the same for all pairs, by the
-same agents without search: in few futures for all M pairs, then in more for the better half, and so
-on. The pair whose bin is fullest on average is taken. An imagined game is an ordinary one, with the
-same masks: search cannot choose what the agents may not.
+The learned agents propose the M legal pairs (orientation, cell) whose joint probability
+π_o(o) · π_p(cell | o) is highest; orientations that give the same box count as one. Each pair is
+then played in futures drawn from the known distribution of the items, the same futures for all
+pairs, by the same agents without search: in few futures for all M pairs, then in more for the
+better half, and so on. The pair whose bin is fullest on average is taken. An imagined game is an
+ordinary game with the same masks, so the search can choose only legal pairs.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from marl_pack.game.packing import Packing
 from marl_pack.items import Stream
 
 AT_ONCE = 1 << 19
-"""Cells of the floors of imagined games that are played at once, about."""
+"""Number of cells, about, on the floors of all imagined games that are played at once."""
 MOST = 1 << 20
-"""Futures of one decision, at most."""
+"""Largest number of futures of one decision."""
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How far to search.
+    """The number of pairs and futures that a search tries, and their depth.
 
     Args:
         rollouts: imagined futures K for each pair, on average.
@@ -59,19 +59,19 @@ class SearchSettings:
 
     @classmethod
     def parse(cls, text: str) -> SearchSettings:
-        """Read ``"rollouts=16,top=8,depth=3"``; what is left out has its default.
+        """Read settings such as ``"rollouts=16,top=8,depth=3"``; missing ones have their defaults.
 
         Raises:
-            ValueError: if it says something else, naming what would be right.
+            ValueError: if the text has another form; says what would be right.
         """
         values = {}
         for part in text.split(","):
             key, _, value = part.partition("=")
             key, value = key.strip(), value.strip()
             if key not in cls.__dataclass_fields__ or not re.fullmatch("[0-9]{1,9}", value):
-                raise ValueError(f"plan {text!r}: {part!r} is none of rollouts=K, top=M, depth=D")
+                raise ValueError(f"plan {text!r}: {part!r}: needs rollouts=K, top=M or depth=D")
             if key in values:
-                raise ValueError(f"plan {text!r}: {key} stands there twice")
+                raise ValueError(f"plan {text!r}: {key} is given twice")
             values[key] = int(value)
         return cls(**values)
 
@@ -80,12 +80,12 @@ class Planner:
     """A policy that searches with two learned agents.
 
     Args:
-        orientation_agent, placement_agent: the agents, with one lookahead; if they are symmetric,
-            they are asked in all symmetries of the bin which pairs are best, while what is imagined
-            they play asked once.
+        orientation_agent, placement_agent: the agents, with one lookahead. If they are symmetric,
+            they are asked in all symmetries of the bin for the best pairs, but only once in each
+            turn of the imagined games.
         critic: the orientation agent's; needed with a ``depth``.
-        settings: how far to search.
-        futures: what may come, e.g. ``make_stream("rs", …)``; drawn again for every decision.
+        settings: of the search.
+        futures: the stream of future items, e.g. ``make_stream("rs", …)``; drawn at each decision.
         seed: of the futures.
     """
 
@@ -102,22 +102,22 @@ class Planner:
             raise ValueError("plan: a depth needs the orientation agent's critic")
         self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
         self.critic, self.settings, self.futures = critic, settings, futures
-        self.seed = -1 - seed  # games have seeds from 0: what really comes is never foreseen
+        self.seed = -1 - seed  # games have seeds from 0, so real items are never foreseen
 
     @torch.inference_mode()
     def __call__(self, game: Packing) -> Placement:
         """Return the best pair of every game, by sequential halving (Karnin et al. 2013).
 
-        Each round plays as many futures in all, and the better half of the pairs goes on to the
-        next, until one is left.
+        Each round plays the same number of futures in all. The better half of the pairs goes to the
+        next round, until one is left.
         """
-        chosen = torch.zeros(game.n, dtype=torch.int64, device=game.device)
+        best = torch.zeros(game.n, dtype=torch.int64, device=game.device)
         games = game.alive.nonzero().squeeze(1)  # [B]
         pairs, legal = self._propose(game, games)  # [B, M]
         total, played = torch.zeros(pairs.shape, dtype=torch.float64, device=game.device), 0
         rounds = max(1, math.ceil(math.log2(self.settings.top)))
-        for left in range(rounds, 0, -1):
-            chosen[games] = pairs[:, 0]
+        for rounds_left in range(rounds, 0, -1):
+            best[games] = pairs[:, 0]
             several = legal.sum(1) > 1
             games, pairs, legal, total = (x[several] for x in (games, pairs, legal, total))
             if not len(games):
@@ -126,11 +126,11 @@ class Planner:
             k = max(1, budget // (rounds * pairs.shape[1]))
             total[legal] += self._sum(game, games, pairs, legal, played, k)
             played += k
-            remaining = 1 if left == 1 else -(-pairs.shape[1] // 2)
+            remaining = 1 if rounds_left == 1 else -(-pairs.shape[1] // 2)
             better = total.masked_fill(~legal, -torch.inf).topk(remaining, 1).indices
             pairs, legal, total = (x.gather(1, better) for x in (pairs, legal, total))
-        chosen[games] = pairs[:, 0]
-        return game.floor.split(chosen)
+        best[games] = pairs[:, 0]
+        return game.floor.split(best)
 
     def _sum(
         self, game: Packing, games: Tensor, pairs: Tensor, legal: Tensor, first: int, k: int
@@ -157,41 +157,42 @@ class Planner:
         return torch.cat(values).view(-1, k).sum(1)
 
     def _futures(self, game: Packing, games: Tensor, first: int, k: int) -> Tensor:
-        """Number the futures int64 [B, k]: others for each game, episode, item and ``first``."""
+        """Return k numbers of futures for each game, int64 [B, k], from number ``first`` on."""
         decision = game.episode[games] * game.bins.boxes.shape[1] + game.t[games]
         numbers = decision * self.settings.top * self.settings.rollouts + first
         return numbers[:, None] + torch.arange(k, device=games.device)
 
     def _propose(self, game: Packing, games: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the M most probable pairs of the games [B], int64 [B, M].
+        """Return the M most probable pairs of the games [B], and which of them are legal.
 
-        With bool [B, M]: false from where fewer than M are legal on.
+        Returns:
+            int64 [B, M], and bool [B, M]: false at the end of rows with fewer than M legal pairs.
         """
-        ways, cells = len(ORIENTATIONS), game.floor.cells
-        every = torch.arange(ways, device=game.device)
+        count, cells = len(ORIENTATIONS), game.floor.cells
+        orientations = torch.arange(count, device=game.device)
         lookahead = self.placement_agent.lookahead
-        probable = [torch.zeros(0, ways, cells, dtype=torch.float64, device=game.device)]
-        for part in torch.split(games, max(1, AT_ONCE // (ways * cells))):
-            some = lookahead.branch(game, part)
-            first = self.orientation_agent.probabilities(self.orientation_agent.observe(some))
-            rows = torch.arange(len(part), device=game.device).repeat_interleave(ways)
-            turned = lookahead.branch(some, rows)
-            observation = self.placement_agent.observe(turned, every.repeat(len(part)))
+        joint = [torch.zeros(0, count, cells, dtype=torch.float64, device=game.device)]
+        for part in torch.split(games, max(1, AT_ONCE // (count * cells))):
+            branch = lookahead.branch(game, part)
+            first = self.orientation_agent.probabilities(self.orientation_agent.observe(branch))
+            rows = torch.arange(len(part), device=game.device).repeat_interleave(count)
+            branch = lookahead.branch(branch, rows)
+            observation = self.placement_agent.observe(branch, orientations.repeat(len(part)))
             second = self.placement_agent.probabilities(observation)  # [b · 6, W · D]
-            probable.append(first[:, :, None] * second.view(-1, ways, cells))
+            joint.append(first[:, :, None] * second.view(-1, count, cells))
         legal = game.mask[games].flatten(2)
         same = _same_boxes(game)[games].double()
-        both = torch.einsum("noe,nec->noc", same, torch.cat(probable) * legal)
+        merged = torch.einsum("noe,nec->noc", same, torch.cat(joint) * legal)
         before = torch.einsum("noe,nec->noc", same.tril(-1), legal.double())
-        both = both.masked_fill(~legal | (before > 0), -1).flatten(1)
-        probability, pairs = both.topk(min(self.settings.top, both.shape[1]))
+        merged = merged.masked_fill(~legal | (before > 0), -1).flatten(1)
+        probability, pairs = merged.topk(min(self.settings.top, merged.shape[1]))
         return pairs, probability >= 0
 
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
-        """Play imagined games on from pairs; return what share of each bin is full at the end [G].
+        """Play imagined games to their end from pairs; return the filled share of each bin, [G].
 
-        With a depth, the critic's value counts for what comes after it: the return (Eq. 5), so that
-        the space that may yet be wasted is taken off.
+        With a depth, each game stops there, and the critic's value is added in place of the rest.
+        It is the return (Eq. 5), so it subtracts the space that may still be wasted.
         """
         value = torch.zeros(game.n, dtype=torch.float64, device=game.device)
         rows = torch.arange(game.n, device=game.device)
@@ -201,11 +202,11 @@ class Planner:
             game.place(*choice, check=False)
             value[rows] = game.bins.filled.double() / game.volume
             steps += 1
-            goes_on = game.alive.nonzero().squeeze(1)
-            if not len(goes_on):
+            alive = game.alive.nonzero().squeeze(1)
+            if not len(alive):
                 return value
-            if len(goes_on) < game.n:
-                rows, game = rows[goes_on], game.branch(goes_on)
+            if len(alive) < game.n:
+                rows, game = rows[alive], game.branch(alive)
             observation = self.orientation_agent.observe(game)
             if steps == self.settings.depth:
                 assert self.critic is not None

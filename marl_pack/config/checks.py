@@ -1,4 +1,4 @@
-"""Checks of settings that types cannot make."""
+"""Check settings beyond what their types can."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from marl_pack.config.schema import Agent, Config
 
 
 class ConfigError(ValueError):
-    """A setting that cannot be, with what would be right."""
+    """A setting is impossible; the message says what would be right."""
 
 
 def refuse(key: str, value: object, right: str) -> None:
@@ -17,7 +17,7 @@ def refuse(key: str, value: object, right: str) -> None:
 
 
 def check(config: Config) -> None:
-    """Refuse what no type can.
+    """Refuse settings that have the right type and are impossible.
 
     Raises:
         ConfigError: naming the key and what would be right.
@@ -28,7 +28,7 @@ def check(config: Config) -> None:
 
 
 def check_ppo(config: Config) -> None:
-    """Refuse settings of the updates that cannot be."""
+    """Refuse impossible settings of the updates."""
     ppo = config.ppo
     for key in ("num_envs", "num_steps_per_env", "max_iterations", "num_learning_epochs",
                 "num_mini_batches"):  # fmt: skip
@@ -62,7 +62,7 @@ def check_ppo(config: Config) -> None:
 
 
 def check_run(config: Config) -> None:
-    """Refuse settings of the process, the evaluation and the output that cannot be."""
+    """Refuse impossible settings of the process, the evaluation and the output."""
     evaluation, output = config.evaluation, config.output
     if config.threads < 1:
         refuse("threads", config.threads, "needs 1 or more")
@@ -81,7 +81,7 @@ def check_run(config: Config) -> None:
 
 
 def check_agents(config: Config) -> None:
-    """Refuse settings of who plays and who learns that cannot be."""
+    """Refuse impossible settings of the agents that play and learn."""
     for name, agent in (("orientation", config.orientation), ("placement", config.placement)):
         if agent.frozen and agent.policy is None:
             refuse(f"{name}.policy", "null", "a frozen agent needs one: say who plays it")
@@ -97,19 +97,19 @@ def check_agents(config: Config) -> None:
 
 
 def check_teacher(name: str, agent: Agent, config: Config) -> None:
-    """Refuse a teacher without an end or a learner that could clone it.
+    """Refuse a teacher without a number of iterations, or without a learner that can clone it.
 
     Raises:
         ConfigError: naming the key and what would be right.
     """
-    key, span = f"{name}.teacher = {agent.teacher}", f"{name}.teacher_iterations"
+    key, duration = f"{name}.teacher = {agent.teacher}", f"{name}.teacher_iterations"
     iterations = agent.teacher_iterations
     if agent.teacher is None:
         if iterations != 0:
-            raise ConfigError(f"{span} = {iterations}: goes with {name}.teacher")
+            raise ConfigError(f"{duration} = {iterations}: goes with {name}.teacher")
         return
     if iterations < 1:
-        raise ConfigError(f"{span} = {iterations}: needs 1 or more")
+        raise ConfigError(f"{duration} = {iterations}: needs 1 or more")
     if agent.frozen:
         raise ConfigError(f"{key}: a frozen agent does not learn")
     if config.joint:

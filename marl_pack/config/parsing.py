@@ -1,4 +1,4 @@
-"""Reading settings from YAML files, the command line and checkpoints."""
+"""Read settings from YAML files, the command line and checkpoints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make_parser() -> ArgumentParser:
     parser.add_argument("--config", action="config", help="YAML file of settings; may be repeated")
     parser.add_argument(
         "--resume", metavar="RUN", default=None,
-        help="go on with the run in this folder, exactly; only output.*, evaluation.* and "
+        help="continue the run in this folder exactly; only output.*, evaluation.* and "
         "ppo.max_iterations may be given beside it",
     )  # fmt: skip
     parser.add_class_arguments(Config, None)
@@ -38,32 +38,32 @@ def make_parser() -> ArgumentParser:
 
 
 def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
-    """Read the settings.
+    """Read the settings from the command line and the files that it names.
 
     Args:
         arguments: of the command line.
 
     Returns:
-        The checked settings, and the options as they were given.
+        The checked settings, and the options before they were checked.
 
     Raises:
         ConfigError: for an unknown key, a wrong type or an impossible value.
     """
-    given = sys.argv[1:] if arguments is None else arguments
-    for before, option in pairwise(("", *given)):
+    words = sys.argv[1:] if arguments is None else arguments
+    for before, option in pairwise(("", *words)):
         path = option if before == "--config" else option.removeprefix("--config=")
-        if "\n" in path:  # settings themselves, not a file's name
+        if "\n" in path:  # the settings themselves, not a file's name
             continue
         if (before == "--config" or path != option) and Path(path).is_file():
             check_file(Path(path))
     parser = make_parser()
     with _explained(parser):
-        options = parser.parse_args(given)
+        options = parser.parse_args(words)
         return build(parser, options), options
 
 
 def check_file(path: Path) -> None:
-    """Refuse what the parser would take silently, or not say where it stands.
+    """Refuse mistakes in a file that the parser would accept or report without their line.
 
     Raises:
         ConfigError: for a file that is no YAML mapping, or has a key twice or an empty section.
@@ -78,21 +78,21 @@ def check_file(path: Path) -> None:
         raise ConfigError(f"{path}: needs keys and values, as configs/rs.yaml has them")
     sections = {key.rpartition(".")[0] for key in keys(make_parser())} - {""}
 
-    def look(node: yaml.MappingNode, prefix: str) -> None:
-        seen = set()
+    def check_section(node: yaml.MappingNode, prefix: str) -> None:
+        names = set()
         for name, value in node.value:
             key, where = f"{prefix}{name.value}", f"{path}, line {name.start_mark.line + 1}"
-            if key in seen:
-                raise ConfigError(f"{where}: {key} stands there twice")
+            if key in names:
+                raise ConfigError(f"{where}: {key} is given twice")
             if key == "resume":
-                raise ConfigError(f"{where}: --resume goes on the command line")
-            seen.add(key)
+                raise ConfigError(f"{where}: --resume needs to be on the command line")
+            names.add(key)
             if isinstance(value, yaml.MappingNode):
-                look(value, f"{key}.")
+                check_section(value, f"{key}.")
             elif key in sections:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
 
-    look(root, "")
+    check_section(root, "")
 
 
 def build(parser: ArgumentParser, options: Namespace) -> Config:
@@ -116,7 +116,7 @@ def from_dict(settings: dict[str, Any]) -> Config:
 
 @contextlib.contextmanager
 def _explained(parser: ArgumentParser) -> Iterator[None]:
-    """Turn what the parser and the settings' own checks raise into ConfigError."""
+    """Raise the errors of the parser and of the settings' own checks as ConfigError."""
     try:
         yield
     except ConfigError:
@@ -128,7 +128,7 @@ def _explained(parser: ArgumentParser) -> Iterator[None]:
 
 
 def keys(parser: ArgumentParser) -> list[str]:
-    """Return every key, dotted."""
+    """Return every key of the settings, with dots between sections."""
     return [
         key for key in parser.get_defaults().keys(branches=False) if key not in ("config", "resume")
     ]
@@ -153,13 +153,13 @@ def explain(parser: ArgumentParser, message: str) -> str:
     section, _, last = key.rpartition(".")
     if last in renamed.AGENT_KEYS:
         return f"unknown key {key}: it is now called {section}.{renamed.AGENT_KEYS[last]}"
-    known = keys(parser)
+    every_key = keys(parser)
     section = key.rpartition(".")[0]
-    while section and not any(name.startswith(section + ".") for name in known):
+    while section and not any(name.startswith(section + ".") for name in every_key):
         section = section.rpartition(".")[0]
     prefix = f"{section}." if section else ""
-    valid = {n[len(prefix) :].partition(".")[0] for n in known if n.startswith(prefix)}
-    near = difflib.get_close_matches(key, known, 1)
+    valid = {n[len(prefix) :].partition(".")[0] for n in every_key if n.startswith(prefix)}
+    near = difflib.get_close_matches(key, every_key, 1)
     guess = f" Did you mean {near[0]}?" if near else ""
     where = f" in {section}" if section else ""
     return f"unknown key {key}.{guess} Keys{where}: {', '.join(sorted(valid))}"

@@ -64,7 +64,7 @@ class Agent:
 
 @dataclass
 class PPO:
-    """Proximal policy optimization, by the names that rsl_rl gives these.
+    """Proximal policy optimization, with rsl_rl's names.
 
     Args:
         num_envs: bins played at once (by each process).
@@ -84,10 +84,11 @@ class PPO:
         schedule: learning rate over the run: fixed; linear, down to 0 at the end; or adaptive, by
             the KL divergence.
         desired_kl: KL divergence of an update that the adaptive schedule aims at.
-        max_grad_norm: longest gradient of the actor, and of the critic.
-        normalize_advantage_per_mini_batch: normalise advantages there, not over the iteration.
+        max_grad_norm: largest norm of the gradient, of the actor's and of the critic's.
+        normalize_advantage_per_mini_batch: normalise advantages in each minibatch, not over the
+            iteration.
         optimizer: the optimiser, one of torch's.
-        symmetry: show each sample to the update through a random symmetry of the bin.
+        symmetry: replace each sample of an update by its image under a random symmetry of the bin.
     """
 
     num_envs: int = 256
@@ -113,7 +114,7 @@ class PPO:
 
 @dataclass
 class Evaluation:
-    """Evaluation during training: the most probable actions, on generated sequences held out.
+    """Evaluation during training, with the most probable actions on held-out sequences.
 
     Args:
         every: iterations between evaluations (and one at the end); 0 for none at all.
@@ -128,15 +129,15 @@ class Evaluation:
 
 @dataclass
 class Output:
-    """Where the run is kept.
+    """Where the run is stored, and how often.
 
     Args:
         folder: where the runs' folders are made.
         name: name of the run's folder; null for one made of the date and time.
-        logger: where scalars go: tensorboard, or wandb (which keeps TensorBoard's files as well).
+        logger: where scalars go: tensorboard, or wandb (which writes TensorBoard's files as well).
         wandb_project: the project on Weights & Biases.
         latest_every: iterations between checkpoints to resume from.
-        keep_every: iterations between checkpoints that are all kept.
+        keep_every: iterations between checkpoints that are never overwritten.
     """
 
     folder: str = "runs"
@@ -149,7 +150,7 @@ class Output:
 
 @dataclass
 class Config:
-    """A training run.
+    """All settings of a training run.
 
     Args:
         seed: seed of weights, actions and items.
@@ -165,7 +166,7 @@ class Config:
         placement: the agent that places the item.
         ppo: how they learn.
         evaluation: evaluation during training.
-        output: where the run is kept.
+        output: where the run is stored.
     """
 
     seed: int = 0

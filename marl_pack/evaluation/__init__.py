@@ -1,5 +1,5 @@
-"""What every program that plays games and measures packings shares.
+"""Play policies and measure their packings, for all programs that do so.
 
-- :mod:`marl_pack.evaluation.rollout` plays policies and gives the plans of their packings;
+- :mod:`marl_pack.evaluation.rollout` plays policies and returns the plans of their packings;
 - :mod:`marl_pack.evaluation.statistics` computes figures of plans.
 """

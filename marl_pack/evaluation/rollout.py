@@ -13,13 +13,13 @@ from marl_pack.agents.policy import Policy
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
 
-BATCH = 1024  # bins played at once, at most
-BATCH_CELLS = 1 << 20  # cells in the maps of those bins, at most
+BATCH = 1024  # games played at once, at most
+BATCH_CELLS = 1 << 20  # cells in the maps of their bins, at most
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """Packings of E episodes, and the time that playing them took."""
+    """The packings of E episodes, and the time it took to play them."""
 
     plans: list[Plan]  # E plans in the order of episodes
     seconds: float  # spent in the game and the policy
@@ -45,7 +45,7 @@ def play(
 
     Args:
         policy: of both agents.
-        game: (n, first_episode) -> a game of n bins without ``auto_reset``.
+        game: (n, first_episode) → n games without ``auto_reset``.
         episodes: how many, E.
         progress: called with the number of episodes that have just ended.
     """
@@ -54,12 +54,12 @@ def play(
     batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))
     seconds = 0.0
     for first in range(0, episodes, batch):
-        table = game(min(batch, episodes - first), first)
-        progress(int((~table.alive).sum()))
+        games = game(min(batch, episodes - first), first)
+        progress(int((~games.alive).sum()))
         start = time.perf_counter()
-        while bool(table.alive.any()):
-            outcome = table.place(*policy(table))
+        while bool(games.alive.any()):
+            outcome = games.place(*policy(games))
             progress(int(outcome.done.sum()))
         seconds += time.perf_counter() - start
-        plans += table.plans()
+        plans += games.plans()
     return Rollout(plans, seconds)

@@ -65,10 +65,10 @@ def strict_equilibrium(plan: Plan) -> bool:
     """Return whether the stack in every bin is in strict static equilibrium as a whole (HiGHS).
 
     Raises:
-        ValueError: if lengths are no whole numbers, which the contacts of faces need.
+        ValueError: unless lengths are whole numbers, which the contacts of faces need.
     """
     if plan.sides.dtype.kind != "i":
-        raise ValueError("the plan has fractions of a unit: scale it to whole numbers")
+        raise ValueError("the plan has fractions of a unit: needs whole numbers, scale it")
     bins = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
     return all(in_equilibrium(own.boxes, own.loads) for own in bins)
 
@@ -84,14 +84,14 @@ def falls(
     Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
     judged), ``judged`` (placements) and ``judge_seconds`` (of one placement).
     """
-    judged = []
-    for one in judge_all(bodies.stacks(plans, range(len(plans))), processes=processes):
-        judged.append(one)
+    results = []
+    for result in judge_all(bodies.stacks(plans, range(len(plans))), processes=processes):
+        results.append(result)
         progress()
-    placements = sum(one.placements for one in judged)
+    placements = sum(result.placements for result in results)
     return {
-        "falls": sum(one.fall is not None for one in judged),
-        "no_verdict": sum(one.error is not None for one in judged),
+        "falls": sum(result.fall is not None for result in results),
+        "no_verdict": sum(result.error is not None for result in results),
         "judged": placements,
-        "judge_seconds": sum(one.seconds for one in judged) / max(placements, 1),
+        "judge_seconds": sum(result.seconds for result in results) / max(placements, 1),
     }

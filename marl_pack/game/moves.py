@@ -1,8 +1,8 @@
 """The legal actions of a game: which orientation, and which cell of the floor.
 
 A placement is a pair of an orientation o (0 … 5) and a cell, the low corner (x, y) of the box,
-numbered ``x · D + y``. The pair itself is numbered ``o · W · D + cell``. This module is the only
-place that knows these numbers.
+numbered ``x · D + y``. The pair itself is numbered ``o · W · D + cell``. Games, agents and
+environments compute these numbers only here.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Floor:
         return x * self.depth + y
 
     def corner(self, cell: Numbers) -> tuple[Numbers, Numbers]:
-        """Return x and y of cells."""
+        """Return the low corner x and y of cells."""
         return cell // self.depth, cell % self.depth
 
     def corners(self, cell: Tensor, backend: Backend) -> Tensor:
@@ -61,11 +61,11 @@ class Floor:
         return code(cell, self.depth)
 
     def pair(self, orientation: Numbers, cell: Numbers) -> Numbers:
-        """Return the number of pairs (orientation, cell)."""
+        """Return the numbers of pairs (orientation, cell)."""
         return orientation * self.cells + cell
 
     def split(self, pair: Numbers) -> tuple[Numbers, Numbers]:
-        """Return orientation and cell of pairs."""
+        """Return the orientation and the cell of pairs."""
         return pair // self.cells, pair % self.cells
 
     def nearest(self, cell: int, legal: NDArray[np.int64]) -> int:
@@ -76,18 +76,18 @@ class Floor:
 
 @dataclass(frozen=True)
 class Moves:
-    """The legal placements of the visible items of G games, one flag an orientation and cell."""
+    """The legal placements of the visible items of G games, as a mask."""
 
     mask: Tensor  # bool [G, 6, W, D]
 
     @property
     def floor(self) -> Floor:
-        """The numbers of cells and pairs."""
+        """The floor, which numbers cells and pairs."""
         return Floor(self.mask.shape[2], self.mask.shape[3])
 
     @property
     def orientations(self) -> Tensor:
-        """Bool [G, 6]: the orientations with a legal cell."""
+        """The orientations with a legal cell, bool [G, 6]."""
         # A sum is many times faster than ``any`` on the CPU.
         return self.mask.sum((2, 3), dtype=torch.int32) > 0
 
@@ -118,8 +118,8 @@ class Moves:
         Returns:
             int64 [G] each; legal wherever there is a legal placement.
         """
-        barred = torch.inf if key.is_floating_point() else torch.iinfo(key.dtype).max
-        return self.floor.split(torch.where(self.mask, key, barred).flatten(1).argmin(1))
+        worst = torch.inf if key.is_floating_point() else torch.iinfo(key.dtype).max
+        return self.floor.split(torch.where(self.mask, key, worst).flatten(1).argmin(1))
 
     @staticmethod
     def gather(values: Tensor, orientation: Tensor, cell: Tensor | None = None) -> Tensor:

@@ -64,7 +64,7 @@ class Packing:
         spec: options of the game; by default the usual ones.
         sides: shortest and longest side of generated items.
         auto_reset: begin a new episode in a game as soon as one ends there. Without it a game that
-            has ended stays as it is, its mask stays empty and what is played there is ignored.
+            has ended does not change, its mask stays empty and its actions are ignored.
         device: where all tensors live.
         backend: compiled loops or tensor code; by default the faster one on the device.
         seed: of the item streams.
@@ -73,7 +73,7 @@ class Packing:
         {options}
 
     Raises:
-        ValueError, TypeError: if an argument cannot be, naming what would be right.
+        ValueError, TypeError: if an argument is impossible; says what would be right.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Packing:
 
     @property
     def t(self) -> Tensor:
-        """Items that each episode has had before the visible one, int64 [G]."""
+        """Number of items that each episode had before the visible one, int64 [G]."""
         return self.state.t
 
     @property
@@ -169,7 +169,7 @@ class Packing:
             self._restart(~self.alive)
 
     def set_state(self, state: GameState) -> None:
-        """Put the games into a state, such as one that :meth:`GameState.select` gave."""
+        """Put the games into a state, such as one that :meth:`GameState.select` returned."""
         self.state = state
         self._find_moves()
 
@@ -179,7 +179,7 @@ class Packing:
         return tensors | {"items_fingerprint": torch.tensor(fingerprint(self.stream))}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a :meth:`state_dict` of games made with the same arguments.
+        """Restore a :meth:`state_dict` of games made with the same arguments.
 
         Raises:
             ValueError: if it is of other games.
@@ -187,7 +187,7 @@ class Packing:
         own = torch.tensor(fingerprint(self.stream))
         if not torch.equal(tensors.get("items_fingerprint", ~own).cpu(), own):
             raise ValueError(
-                "state of another game: its items are not this game's; a changed file?"
+                "state of another game: needs the items of this game; was their file changed?"
             )
         self.state.load(tensors)
         self._find_moves()
@@ -199,13 +199,13 @@ class Packing:
         seed: int = 0,
         episodes: Tensor | None = None,
     ) -> Packing:
-        """Return games that begin as copies of some of these, and then go on by themselves.
+        """Return games that begin as copies of some of these and are then played independently.
 
         They do not restart when they end.
 
         Args:
             games: int64 [K], the games to copy; one may come several times.
-            stream: what comes after the visible items; as here, unless given.
+            stream: of the items after the visible ones; this game's by default.
             seed, episodes: int64 [K], the episodes of ``stream`` that come.
         """
         branched = copy.copy(self)
@@ -227,7 +227,7 @@ class Packing:
         return branched
 
     def plans(self) -> list[Plan]:
-        """Return what stands in each bin, a plan for each game."""
+        """Return the boxes in each bin as a plan, one for each game."""
         bins, names = self.bins.to("cpu"), self.stream.id_names
         return [Plan.from_bins(bins, g, id_names=names) for g in range(self.n)]
 
@@ -238,7 +238,9 @@ class Packing:
         return self.legal.orient(items)
 
     def orient(self, orientation: Tensor) -> Oriented:
-        """First turn: return what each item shows in an orientation. Changes nothing.
+        """Return each item in an orientation, with its legal cells: the first turn.
+
+        It changes nothing in the game.
 
         Args:
             orientation: int64 [G], indices into :data:`marl_pack.bins.ORIENTATIONS`.
@@ -250,16 +252,16 @@ class Packing:
         return self.items.sides.gather(1, orientation_table(self.device)[orientation])
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
-        """Second turn: place each item, and bring the next one.
+        """Place each item and bring the next one: the second turn.
 
         Args:
             orientation: int64 [G], as in :meth:`orient`.
             cell: int64 [G], low corners (:class:`marl_pack.game.moves.Floor`).
-            check: whether to look if the choices are legal. Only a caller that has taken them from
-                the mask may do without: an illegal one would spoil the stack.
+            check: whether to check that the choices are legal. Leave it out only for choices taken
+                from the mask: an illegal one makes the state invalid.
 
         Raises:
-            ValueError: if a choice is not legal; nothing has changed then.
+            ValueError: if a choice is not legal; then nothing has changed.
         """
         state, alive = self.state, self.alive
         if orientation.shape != (self.n,) or cell.shape != (self.n,):
@@ -297,17 +299,17 @@ class Packing:
         return Outcome(reward, done, filled, placed, self.volume)
 
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
-        """Raise ValueError if a choice in a game that goes on is not legal."""
+        """Raise ValueError if a choice in a game that has not ended is not legal."""
         legal = self.moves.allows(orientation, cell)
         if not self.spec.mask_orientations:  # an orientation without a cell may be chosen
             real = (orientation >= 0) & (orientation < len(ALL_ORIENTATIONS))
             real &= (cell >= 0) & (cell < self.floor.cells)
             chosen = orientation * real
-            none = ~Moves.gather(self.moves.orientations, chosen)
-            legal |= real & none & Moves.gather(self.orientation_mask, chosen)
-        wrong = self.alive & ~legal
-        if bool(wrong.any()):
-            g = int(wrong.nonzero()[0])
+            without_cell = ~Moves.gather(self.moves.orientations, chosen)
+            legal |= real & without_cell & Moves.gather(self.orientation_mask, chosen)
+        illegal = self.alive & ~legal
+        if bool(illegal.any()):
+            g = int(illegal.nonzero()[0])
             x, y = self.floor.corner(int(cell[g]))
             raise ValueError(
                 f"game {g}: item {self.items.sides[g].tolist()} in orientation "
@@ -360,7 +362,7 @@ class Packing:
         self.orientation_mask[games], self.alive[games] = self.legal.choices(moves, items)
 
     def _begin_by_mask(self, ended: Tensor) -> None:
-        """Begin the next episode where ``ended``: every shape is fixed, so a device never waits."""
+        """Begin the next episode where ``ended``, with fixed shapes, so that no device waits."""
         state = self.state
         state.episode = torch.where(ended, state.episode + self.n, state.episode)
         state.t = state.t.masked_fill(ended, 0)

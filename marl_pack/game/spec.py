@@ -1,7 +1,7 @@
 """The options of a game, each listed once: :class:`GameSpec`.
 
 Settings files, command lines, the PettingZoo environment, checkpoints and the words that describe
-a game derive from the fields of this record. A new option is one field here and the code that uses
+a game derive from the fields of this record. A new option is one field here, and the code that uses
 it.
 """
 
@@ -42,7 +42,7 @@ def _option(
         default: its value unless another is given.
         sentence: what it does, with its range.
         check: returns the value in its right type; raises ValueError saying what would be right.
-        phrase: the value in the words that describe a game.
+        phrase: the value → words that describe it.
         **argument: of ``argparse.add_argument``, beside its name and its help; with ``flag`` in
             place of the name where that differs.
     """
@@ -98,7 +98,7 @@ def _max_items(value: Any) -> int | None:
 
 
 def _rule_name(rule: Any) -> str:
-    """Return the name of a rule, whether it is named or bound."""
+    """Return the name of a rule, given by its name or as a bound function."""
     return rule if isinstance(rule, str) else getattr(getattr(rule, "func", rule), "__name__", "?")
 
 
@@ -187,15 +187,13 @@ class GameSpec:
         if isinstance(self.rule, str):
             return make_rule(self.rule, **parameters)
         if parameters:
-            raise ValueError(
-                f"{', '.join(parameters)}: goes with the name of a rule, not with a bound one"
-            )
+            raise ValueError(f"{', '.join(parameters)}: needs the name of a rule, not a function")
         rule: Rule = self.rule
         return rule
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> GameSpec:
-        """Return the spec with the options that ``values`` holds; other keys are left out.
+        """Return the spec with the options in ``values``; other keys are ignored.
 
         Args:
             values: such as the section ``game`` of a run's settings.
@@ -208,7 +206,7 @@ class GameSpec:
 
         Raises:
             TypeError: for a name that is no option, with the nearest one.
-            ValueError: for a value that cannot be, or an old name.
+            ValueError: for an impossible value, or an old name.
         """
         names = [option.name for option in fields(GameSpec)]
         for name in options:
@@ -277,7 +275,7 @@ def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) ->
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add every option to a command, by its name; not given is None."""
+    """Add every option to a command by its name, with the default None."""
     for option in fields(GameSpec):
         argument = dict(option.metadata["argument"])
         flag = argument.pop("flag", option.name.replace("_", "-"))

@@ -19,7 +19,7 @@ from marl_pack.items.items import Items
 
 @dataclass
 class GameState:
-    """G games in play. Copying, selecting and saving derive from the fields."""
+    """The state of G games in play; copying, selecting and saving derive from the fields."""
 
     bins: Bins  # of G bins: game g packs bin g
     items: Items  # [G], the visible item of each game; zero sides at the end of its sequence

@@ -1,4 +1,4 @@
-"""Sizes of bins and the six orientations of a box."""
+"""The sizes of bins, and the six orientations of a box."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
 )
 """The six axis permutations of a box: row ``o`` names which of the item's own sides
 (0 = w, 1 = d, 2 = h) lies along x, y and z. ``o // 2`` picks the side that stands upright
-(h, d, w) and ``o ^ 1`` is the same box rotated by 90° about the vertical, so 0 is the item as
-it comes and {0, 1} are the two orientations that keep it upright."""
+(h, d, w), and ``o ^ 1`` is the same box rotated by 90° about the vertical. So 0 is the item as
+it comes, and {0, 1} are the two orientations that keep it upright."""
 
 MAX_HEIGHT = 16383
 """Height of the tallest bin in cells: masks compare ``2 · height + 1`` as 16-bit integers."""
@@ -40,7 +40,7 @@ def _is_number(value: object) -> bool:
 
 
 def check_size(size: Size) -> Size:
-    """Return ``size`` as three ints.
+    """Return a bin's ``size`` as three ints.
 
     Raises:
         ValueError: unless it is three whole numbers from 1 to the largest allowed.

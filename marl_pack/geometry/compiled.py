@@ -120,10 +120,10 @@ def resting_heights_and_waste(
     cells = width * depth
     spare, out = np.empty(cells, np.int16), np.empty(cells, np.int16)
     below = np.zeros((width + 1, depth + 1), np.int32)
-    wanted = waste.size > 0
+    with_waste = waste.size > 0
     for b in range(n):
         flat = heightmap[b].reshape(cells)
-        if wanted:
+        if with_waste:
             for x in range(width):
                 row = 0
                 for y in range(depth):
@@ -132,7 +132,7 @@ def resting_heights_and_waste(
         for a in range(sides.shape[1]):
             w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
             resting_heights[b, a] = height
-            if wanted:
+            if with_waste:
                 waste[b, a] = 0
             if not (0 < w <= width and 0 < d <= depth and h > 0):
                 continue
@@ -141,7 +141,7 @@ def resting_heights_and_waste(
                 for y in range(depth - d + 1):
                     z = top[x * depth + y]
                     resting_heights[b, a, x, y] = z
-                    if wanted:
+                    if with_waste:
                         under = (
                             below[x + w, y + d] - below[x, y + d] - below[x + w, y] + below[x, y]
                         )

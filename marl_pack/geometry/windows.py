@@ -18,14 +18,14 @@ def resting_heights_and_waste(
     waste: bool = True,
     backend: Backend | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Compute where each box would come to rest at every cell, and the cells it would waste.
+    """Compute resting height and wasted cells of each box at every cell.
 
     Args:
         heightmap: int16 [N, W, D], the top of each column.
-        sides: int16 [N, A, 3], the boxes' sides along x, y, z; a zero side fits nowhere.
+        sides: int16 [N, A, 3], the boxes' sides along x, y, z; with a zero side nowhere inside.
         height: H.
         waste: whether to compute the wasted cells (else they have no entries).
-        backend: which code computes it; the device's default if None.
+        backend: computes it; the device's default if None.
 
     Returns:
         int16 [N, A, W, D], resting heights, H where the window does not lie inside the map; and

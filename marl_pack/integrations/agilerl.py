@@ -1,7 +1,7 @@
-"""AgileRL: the masked actor-critic as two networks, and observations that it lets pass.
+"""AgileRL: the masked actor-critic as two networks, and observations that hold the mask.
 
-AgileRL looks for masks in ``info["action_mask"]`` and forgets them when it learns. So the mask
-travels in the observation here, under the name ``legal`` (it refuses ``action_mask`` there), and
+AgileRL reads masks from ``info["action_mask"]`` and does not use them when it learns. So the mask
+is in the observation here, under the name ``legal`` (it refuses ``action_mask`` there), and
 the networks apply it, also when learning.
 """
 
@@ -18,7 +18,7 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class Masked(EvolvableModule):
-    """An :class:`ActorCritic` as AgileRL wants it.
+    """An :class:`ActorCritic` with AgileRL's interface.
 
     Args:
         agent: name of the agent, ``"orientation_0"`` or ``"placement_0"``.

@@ -54,7 +54,7 @@ class PackingTask(PettingZooClass):
 
 
 class MaskedModel(Model):
-    """An :class:`ActorCritic` as BenchMARL wants it; as a critic it gives values.
+    """An :class:`ActorCritic` with BenchMARL's interface; as a critic it gives values.
 
     BenchMARL's losses also run over the turns of the other agent. Logits are constant there, so
     that no gradient reaches the policy; the critic learns the values of these turns.
@@ -82,7 +82,7 @@ class MaskedModel(Model):
 
 @dataclass
 class MaskedModelConfig(ModelConfig):
-    """Settings of :class:`MaskedModel`: there are none."""
+    """The settings of :class:`MaskedModel`, which has none."""
 
     @staticmethod
     def associated_class() -> type[Model]:

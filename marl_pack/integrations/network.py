@@ -17,7 +17,7 @@ SCORES = {"orientation": (True, False), "placement": (False, True), "both": (Tru
 
 
 class ActorCritic(nn.Module):
-    """A network that turns one agent's planes and mask into logits and the state's value.
+    """A network that computes logits and the state's value from one agent's planes and mask.
 
     Args:
         agent: ``"orientation"`` scores six orientations, ``"placement"`` every cell;
@@ -45,7 +45,7 @@ class ActorCritic(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of its weights."""
+        """The device of the network's weights."""
         return self.cells.weight.device
 
     def forward(self, planes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +58,7 @@ class ActorCritic(nn.Module):
         legal = mask.bool()
         batch, _, width, depth = planes.shape
         both = self.scores_orientations and self.scores_cells
-        if self.scores_cells:  # where the item may go says most
+        if self.scores_cells:  # the legal cells are the most useful plane
             cells = legal[:, : width * depth].reshape(batch, 1, width, depth).to(planes.dtype)
             if both:
                 cells = cells * planes[:, 4:]  # in the orientation's turn the mask has no cells

@@ -13,7 +13,7 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class MaskedModule(TorchRLModule, ValueFunctionAPI):
-    """An :class:`ActorCritic` as RLlib wants it; ``model_config={"agent": "orientation"}``.
+    """An :class:`ActorCritic` with RLlib's interface; ``model_config={"agent": "orientation"}``.
 
     It reads the mask from the observation. Connectors ask for values through ``ValueFunctionAPI``.
     """

@@ -1,4 +1,4 @@
-"""Stable-Baselines3 (sb3-contrib): both agents' turns as those of one, and the masked policy."""
+"""Stable-Baselines3 (sb3-contrib): one agent for both turns, and the masked policy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class Turns(gymnasium.Env[Any, Any]):
-    """Both agents' turns as those of one agent; the reward is the one they share.
+    """A Gymnasium environment whose single agent plays both turns for the shared reward.
 
     Args:
         env: an AEC environment with ``pad_actions=True``.
@@ -52,7 +52,7 @@ class Turns(gymnasium.Env[Any, Any]):
 class MaskedPolicy(MaskableMultiInputActorCriticPolicy):
     """A policy that is one :class:`ActorCritic` for both turns.
 
-    The value of a state is asked for without a mask, so the policy reads it from the observation.
+    MaskablePPO asks for values without a mask, so the policy reads the mask from the observation.
     """
 
     def _build(self, lr_schedule: Any) -> None:
@@ -80,7 +80,7 @@ class MaskedPolicy(MaskableMultiInputActorCriticPolicy):
         return values, choice.log_prob(actions), choice.entropy()
 
     def get_distribution(self, obs: Any, action_masks: Any = None) -> Any:
-        """Return the actions' distribution."""
+        """Return the distribution of actions."""
         return self._outputs(obs, action_masks)[0]
 
     def predict_values(self, obs: Any) -> Tensor:

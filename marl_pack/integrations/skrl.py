@@ -11,7 +11,7 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class MaskedModel(CategoricalMixin, DeterministicMixin, Model):
-    """An :class:`ActorCritic` as skrl wants it; skrl knows no masks, so the model applies them.
+    """An :class:`ActorCritic` with skrl's interface; it applies the masks, which skrl does not.
 
     Args:
         agent: name of the agent, ``"orientation_0"`` or ``"placement_0"``.

@@ -22,19 +22,19 @@ def outputs(network: ActorCritic, batch: Any) -> tuple[torch.Tensor, torch.Tenso
 
 
 class Actor(ActionReprNet):
-    """The network's logits, as Tianshou wants them."""
+    """The network's logits, with Tianshou's interface."""
 
     def __init__(self, network: ActorCritic) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, obs: Any, state: Any = None, info: Any = None) -> tuple[torch.Tensor, Any]:
-        """Return masked logits [B, n], and the state as it was."""
+        """Return masked logits [B, n], and the state unchanged."""
         return outputs(self.network, obs)[0], state
 
 
 class Critic(nn.Module):
-    """The network's values, as Tianshou wants them."""
+    """The network's values, with Tianshou's interface."""
 
     def __init__(self, network: ActorCritic) -> None:
         super().__init__()
@@ -46,14 +46,14 @@ class Critic(nn.Module):
 
 
 class OwnTurns(MultiAgentOnPolicyAlgorithm):
-    """Learners of several agents, each given its own turns in a row.
+    """The learners of several agents, each of which learns from its own turns only.
 
-    Tianshou takes every turn as a step of its own. Here an agent's reward is all that it got until
+    Tianshou treats every turn as a step. Here an agent's reward is the sum of its rewards until
     its next turn, and its next observation is that of its next turn.
     """
 
     def _preprocess_batch(self, batch: Any, buffer: Any, indices: Any) -> Any:
-        """Return the batch of each agent, by its name, as its learner wants it."""
+        """Return the batch of each agent's learner, by the agent's name."""
         batches = {}
         for column, agent in enumerate(AGENTS):
             own = np.flatnonzero(batch.obs.agent_id == agent)

@@ -11,7 +11,7 @@ from marl_pack.integrations.network import ActorCritic
 class Part(torch.nn.Module):
     """One of a network's two outputs, for any leading shape; TorchRL adds a dimension of agents.
 
-    In the other agent's turn TorchRL's mask is full. It is taken as empty here, so that logits are
+    In the other agent's turn TorchRL's mask is full. It is used as empty here, so that logits are
     constant and no gradient reaches the policy from that turn; the critic learns its value.
 
     Args:

@@ -92,10 +92,10 @@ def _read_csv(path: Path) -> dict[str, Any]:
 
 
 def _read_table(path: Path) -> dict[str, list[str]]:
-    """Return the texts of each column by its name, of which w, d and h are numbers.
+    """Return the texts of each column by its name; those of w, d and h are numbers.
 
     Raises:
-        ValueError: for a column that is missing, unknown or there twice, or a row with too few
+        ValueError: for a column that is missing, unknown or given twice, or a row with too few
             or too many values or a side that is no number, which is named.
     """
     try:
@@ -106,7 +106,7 @@ def _read_table(path: Path) -> dict[str, list[str]]:
     columns = [name.strip() for name in next(reader, [])]
     check_names(columns, COLUMNS, SIDES, str(path), "column")
     if len(set(columns)) < len(columns):
-        raise ValueError(f"{path}: a column is there twice; the first line is {columns}")
+        raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
     places = [columns.index(name) for name in SIDES]
     cells: list[str] = []  # row by row in one list: a list for each row is three times slower
     for row in filter(None, reader):

@@ -54,16 +54,16 @@ class Items:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def numbered(self, t: Tensor) -> Items:
-        """Return the items with the ids ``t``, their places, unless they have their own."""
+        """Return the items with their places ``t`` as ids, unless they have ids."""
         return self if self.ids is not None else Items(**self.tensors() | {"ids": t})
 
     def ids_at(self, t: Tensor) -> Tensor:
-        """Return the items' ids; their places ``t`` where they have none."""
+        """Return the items' ids, or their places ``t`` if they have none."""
         return t if self.ids is None else self.ids
 
     @property
     def present(self) -> Tensor:
-        """Where there is an item, bool [...]."""
+        """The entries that hold an item, bool [...]."""
         return self.sides[..., 0] > 0
 
     def orientation_sets(self) -> dict[tuple[int, ...], float]:
@@ -77,7 +77,7 @@ class Items:
 
 
 def join(parts: Sequence[Items]) -> Items:
-    """Return the items of ``parts`` one after the other; all have the same fields."""
+    """Return the items of all ``parts``, which have the same fields, in one record."""
     tensors = [part.tensors() for part in parts]
     return Items(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
@@ -141,7 +141,7 @@ TRUTH |= {"false": False, "no": False, "0": False, 0: False}
 
 
 def _truth(value: Any) -> bool:
-    """Return the truth that a text, a number or a bool stands for."""
+    """Return the bool that a text, a number or a bool stands for."""
     return TRUTH[value.lower() if isinstance(value, str) else value]
 
 

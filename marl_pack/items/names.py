@@ -1,4 +1,4 @@
-"""Names of columns, keys and arrays: unknown ones are refused with the nearest valid name."""
+"""Check names of columns, keys and arrays; suggest the nearest valid name."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def check_names(
     """Refuse names that are unknown or missing.
 
     Args:
-        names: the names that are used.
+        names: the names to check.
         valid: the names that may be used.
-        required: those of them that must be.
+        required: the names that may not be missing.
         source: the file or argument, for the message.
-        what: a column, key, array or attribute.
+        what: what they name: a column, key, array or attribute.
 
     Raises:
         ValueError: naming what is missing or unknown, the nearest valid name and all of them.

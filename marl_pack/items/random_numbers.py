@@ -1,4 +1,4 @@
-"""Counter-based random numbers, equal on every device, in every batch, in tensors and loops."""
+"""Counter-based random numbers, equal on every device, in every batch and by both backends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Given sequences of items: their check, and the stream that plays them."""
+"""Sequences of items that the user gives: their checks, and the stream that plays them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marl_pack.items.names import check_names
 
 @dataclass(frozen=True)
 class Sequences:
-    """Given sequences, played in their order: episode k is sequence k modulo their number."""
+    """The stream of given sequences: episode k is sequence k modulo their number."""
 
     items: Items  # [S, L]          zeros after each sequence's end
     id_names: tuple[str, ...] | None = None  # texts that ``items.ids`` index
@@ -58,7 +58,7 @@ class Sequences:
         return episodes % self.episodes
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
-        """Return the state where the episodes ``ended`` begin the sequences ``episodes``."""
+        """Return the state in which the games ``ended`` begin the sequences ``episodes``."""
         return torch.where(ended, self.start(seed, episodes), state)
 
     def item(self, state: Tensor, t: Tensor) -> Items:
@@ -75,12 +75,12 @@ class Sequences:
         return replace(self, items=self.items.to(device))
 
 
-# --- their check ----------------------------------------------------------------------------------
+# --- the checks -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The given rows of all sequences, one after the other, with their places for messages."""
+    """The rows of all sequences, one after the other, with their numbers for error messages."""
 
     sides: NDArray[np.float64]  # [R, 3]
     sequence: NDArray[np.int64]  # [R]   number of the sequence
@@ -121,7 +121,7 @@ def check_items(
     source: str = "items",
     **attributes: Any,
 ) -> Sequences:
-    """Return the sequences that arrays or lists give; refuse an item that is impossible.
+    """Check items in arrays or lists, and return them as sequences; refuse impossible ones.
 
     Args:
         items: whole numbers [L, 3] (one sequence) or [S, L, 3], rows w, d, h in cells; or a list of
@@ -221,7 +221,7 @@ def _read_block(rows: Any, name: str) -> NDArray[np.float64]:
 
 
 def _is_row(row: Any) -> bool:
-    """Return whether ``row`` is three numbers, of whatever value."""
+    """Return whether ``row`` is three numbers of any value."""
     if not _is_list(row) or len(row) != 3:
         return False
     return all(isinstance(value, Real) and not isinstance(value, bool) for value in row)
@@ -313,15 +313,15 @@ def _allowed(
 def _check_fit(rows: Rows, allowed: NDArray[np.bool_], size: Size) -> None:
     """Refuse an item that fits into the bin in none of its orientations."""
     short = rows.sides[:, :, None] <= np.array(size)  # [R, 3, 3]: side i along axis j
-    fits = short[:, np.array(ORIENTATIONS), np.arange(3)].all(2)  # [R, 6]
-    wrong = np.logical_not((fits & allowed).any(1))
+    in_bin = short[:, np.array(ORIENTATIONS), np.arange(3)].all(2)  # [R, 6]
+    wrong = np.logical_not((in_bin & allowed).any(1))
     own = np.flatnonzero(allowed[wrong.argmax()]).tolist()
     which = "no orientation" if len(own) == 6 else f"none of its orientations {own}"
     rows.refuse(wrong, f"fits into the bin {tuple(size)} in {which}")
 
 
 def number_ids(ids: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[str, ...] | None]:
-    """Return ids as whole numbers: themselves, or indices into the texts, which are returned too.
+    """Return ids as whole numbers: the ids themselves, or indices into texts, returned as well.
 
     Args:
         ids: texts and whole numbers [R]. Texts such as "007" are not numbers.

@@ -1,4 +1,4 @@
-"""Return the stream that a name, a file, an array, a mapping or a record names."""
+"""Make the stream that a name, a file, an array, a mapping or a record stands for."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEFAULT_SIDES = (2, 5)
 """Shortest and longest side of a generated item: the 64 types {2..5}³ of RS and CUT."""
 
 MEMBERS = tuple(name for name in vars(Stream) if not name.startswith("_"))
-"""What a stream has."""
+"""Names of the members of a stream."""
 
 
 def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
@@ -65,7 +65,7 @@ def _from_fields(
         raise ValueError(f"{source}: {error}") from None
     bin_size = own if size is None else check_size(size)
     if bin_size is None:
-        raise ValueError(f"{source}: names no bin size; give one")
+        raise ValueError(f"{source}: needs a bin size, as it has none of its own")
     if own not in (None, bin_size):
         raise ValueError(f"{source}: is for the bin {own}, not {bin_size}; give that size")
     attributes = {key: values for key, values in fields.items() if key not in ("items", "bin")}
@@ -77,7 +77,7 @@ def make_stream(
     size: Size,
     sides: tuple[int, int] = DEFAULT_SIDES,
 ) -> Stream:
-    """Return the stream that ``items`` names.
+    """Return the stream that ``items`` stands for.
 
     Args:
         items: ``"rs"``, ``"cut1"``, ``"cut2"``; a file (:func:`load`); an array [L, 3] or
@@ -108,14 +108,14 @@ def make_stream(
     missing = [name for name in MEMBERS if not hasattr(items, name)]
     if missing:
         raise ValueError(
-            f"items {type(items).__name__}: neither an array nor a stream, which also needs "
+            f"items {type(items).__name__}: needs to be an array or a stream, which also needs "
             f"{', '.join(missing)}"
         )
     return items  # type: ignore[return-value]  # it has the members of a Stream
 
 
 def _generated(name: str, size: Size, sides: tuple[int, int]) -> Stream:
-    """Return the stream of :data:`GENERATED`, refused if it cannot bring items for this bin."""
+    """Return a stream of :data:`GENERATED`; refuse one that has no items for this bin."""
     low, high = check_sides(sides)
     if name == "rs":
         if high > min(size):

@@ -1,4 +1,4 @@
-"""Item streams: what the conveyor brings, episode by episode.
+"""Item streams: the items that the conveyor brings, episode by episode.
 
 A stream is three pure functions. ``start(seed, episodes)`` returns the state of each episode,
 ``item(state, t)`` the item at step t of each, and ``restart`` the state after some have ended.
@@ -29,7 +29,7 @@ from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mi
 
 
 class Stream(Protocol):
-    """Source of items, one after the other, in numbered episodes."""
+    """A source of items, one after the other, in numbered episodes."""
 
     @property
     def smallest(self) -> int:
@@ -66,7 +66,7 @@ class Stream(Protocol):
         ...
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
-        """Return the state [N, …] where some episodes begin and the others go on.
+        """Return the state [N, …] in which some episodes begin and the others continue.
 
         Args:
             state: of the N episodes; it is not changed.
@@ -124,7 +124,7 @@ def _uniform_tensor(keys: Tensor, t: Tensor, low: int, kinds: int) -> tuple[Tens
 
 @dataclass(frozen=True)
 class Uniform:
-    """RS: i.i.d. uniform over the types {low..high}³, without end."""
+    """The stream RS: items drawn uniformly from the types {low..high}³, without end."""
 
     low: int
     high: int
@@ -140,7 +140,7 @@ class Uniform:
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Shortest and longest side, in cells."""
+        """Shortest and longest side of an item, in cells."""
         return self.low, self.high
 
     @property
@@ -172,7 +172,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Cut:
-    """CUT-1 (``order`` 1) or CUT-2 (2): pieces of the bin, so that a perfect packing exists."""
+    """The stream CUT-1 (``order`` 1) or CUT-2 (2): pieces of the bin, which fill it perfectly."""
 
     size: Size
     order: Literal[1, 2]
@@ -234,7 +234,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Items drawn i.i.d. from the rows of a table, without end."""
+    """A stream of items drawn i.i.d. from the rows of a table, without end."""
 
     items: Items  # [R]
     episodes: None = None
@@ -274,7 +274,7 @@ class Drawn:
 
 
 AT_ONCE = 1 << 20
-"""About as many numbers of states are copied at once when a stream's items are collected."""
+"""About how many numbers of states are copied at once when a stream's items are collected."""
 
 
 def independent(stream: Stream, sequences: int = 500) -> Stream:

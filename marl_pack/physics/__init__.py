@@ -1,4 +1,4 @@
 """Programs that judge packings in physics: Table 1, controls, saved packings, pictures and films.
 
-The judge itself is :mod:`marl_pack.sapien_check`, which knows nothing of how a stack was packed.
+The judge itself is :mod:`marl_pack.sapien_check`, which does not depend on how a stack was packed.
 """

@@ -1,7 +1,7 @@
 """Judge stacks in physics: ``python -m marl_pack.sapien_check COMMAND``.
 
 - ``table1``: the paper's Table 1, objects placed at random under a stability rule;
-- ``controls``: stacks whose fate is known, and the margins at which the verdict flips;
+- ``controls``: stacks with a known verdict, and the margins at which the judge's verdict flips;
 - ``stack FILE``: packings saved by ``python -m marl_pack.evaluate --save-stacks``; also pictures
   and films.
 """
@@ -40,7 +40,7 @@ from marl_pack.stability import RULES
 
 
 def _progress(console: Console) -> Progress:
-    """Return a bar that is gone when the work is done."""
+    """Return a progress bar that is removed when the work is done."""
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TimeRemainingColumn(), console=console, transient=True,
@@ -191,10 +191,10 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     chosen = every if options.episodes is None else list(dict.fromkeys(options.episodes))
     for e in chosen:
         if e not in every:
-            raise ValueError(f"--episodes {e}: the file has {len(every)}, counted from 0")
+            raise ValueError(f"--episodes {e}: needs numbers from 0 to {len(every) - 1}")
     if options.render is not None:
         if len(chosen) != 1:
-            raise ValueError("--render shows one stack: name it by --episodes K")
+            raise ValueError("--render: needs one stack; name it by --episodes K")
         title = f"{options.file.stem}, episode {chosen[0]}"
         draw(bodies.stack(plans[chosen[0]], chosen[0]), title, options, console)
     judged: dict[int, Judged] = {}
@@ -247,7 +247,7 @@ def show_judged(judged: dict[int, Judged], console: Console) -> None:
 
 
 def in_words(fall: Verdict) -> str:
-    """Return a fall in words: the box placed last, and the box that rotated most."""
+    """Describe a fall: the box placed last, and the box that rotated most."""
     farthest = max(fall.moved, key=lambda i: fall.angle[i])
     others = f" and {len(fall.moved) - 1} more" if len(fall.moved) > 1 else ""
     return (
@@ -301,7 +301,7 @@ def parser() -> argparse.ArgumentParser:
              "stack")  # fmt: skip
 
     commands.add_parser(
-        "controls", parents=[shared], help="stacks whose fate is known",
+        "controls", parents=[shared], help="stacks with a known verdict",
         description=controls.__doc__,
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
-"""Stacks whose fate is known by statics, to test the judge with.
+"""Stacks that are known by statics to stand or to fall, to test the judge.
 
 Each family has a margin in millimetres: how far the decisive centre of mass lies inside its support
-(positive: the stack stands; negative: it falls). Beside the judge stands the exact equilibrium.
+(positive: the stack stands; negative: it falls). The exact equilibrium is computed as well.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def heavy_on_light(ratio: float, margin: float) -> Plan:
 
 
 def harmonic(count: int, margin: float) -> Plan:
-    """Return planks, each as far out as those above allow less 5 mm; the lowest decides."""
+    """Return an overhang of planks, each 5 mm inside its limit, and the lowest by the margin."""
     length, rows, centre = 300.0, [(0.0, 0.0, 50.0 * (count - 1), 300.0, 100.0, 50.0)], 150.0
     for above in range(1, count):
         slack = margin if above == count - 1 else 5.0
@@ -133,7 +133,7 @@ FAMILIES: dict[str, Callable[[float], Plan]] = {
 
 
 def tower(count: int, edge: float) -> Plan:
-    """Return cubes one on the other."""
+    """Return a tower of cubes, one on the other."""
     return _plan(*((0, 0, edge * k, edge, edge, edge) for k in range(count)))
 
 
@@ -152,15 +152,15 @@ STANDING: dict[str, Callable[[], Plan]] = {
     "tower of 6 cubes of 100 mm": partial(tower, 6, 100.0),
     "wall of bricks": wall_of_bricks,
 }
-"""Stacks that stand with room to spare."""
+"""Stacks that stand with a large margin."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Verdicts on one control, each true if it stands."""
+    """The verdicts on one control, each true if it stands."""
 
     name: str
-    margin: float | None  # mm; None: stands with room to spare
+    margin: float | None  # mm; None: stands with a large margin
     known: bool  # by statics
     judge: bool
     equilibrium: bool

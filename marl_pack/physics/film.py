@@ -1,6 +1,6 @@
-"""Pictures and films of a stack: built box by box, settling, and falling if it falls.
+"""Draw pictures and films of a stack as it is built in physics, box by box.
 
-All boxes and the bin's walls collide here, so that what has fallen comes to rest as it would in a
+All boxes and the bin's walls collide, so that fallen boxes come to rest as they would in a
 real bin. Drawn by PyVista (VTK), which needs neither a GPU nor a display.
 """
 
@@ -43,7 +43,7 @@ COLOURS = [colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")]
 
 @dataclass(frozen=True)
 class Frame:
-    """Poses of the boxes at one moment."""
+    """The poses of the boxes at one moment."""
 
     middles: Floats  # [k, 3]  metres
     rotations: Floats  # [k, 4]  quaternions, w first
@@ -70,7 +70,7 @@ def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
 
 
 def _watch(world: World, seconds: float) -> Iterator[Frame]:
-    """Yield the frames of so many seconds."""
+    """Simulate ``seconds`` and yield their frames."""
     for _ in range(round(seconds * FPS)):
         world.run(1 / FPS)
         yield Frame(*world.poses(), world.moved())
@@ -89,8 +89,8 @@ class View:
         self.plotter.set_background("white")
         self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
         w, d, h = (float(s) for s in stack.size)
-        room = pyvista.Box((0, w, 0, d, 0, h))
-        self.plotter.add_mesh(room, style="wireframe", color="#707070", line_width=2)
+        outline = pyvista.Box((0, w, 0, d, 0, h))
+        self.plotter.add_mesh(outline, style="wireframe", color="#707070", line_width=2)
         floor = pyvista.Box((0, w, 0, d, -0.01 * h, 0))
         self.plotter.add_mesh(floor, color="#e8e8e8")
         self.boxes = [self._add(stack, i) for i in range(len(stack))]
@@ -116,10 +116,10 @@ class View:
     def picture(self, frame: Frame) -> NDArray[np.uint8]:
         """Draw one moment, uint8 [height, width, 3], with boxes that have moved in red."""
         for i, actors in enumerate(self.boxes):
-            here = i < len(frame.middles)
+            visible = i < len(frame.middles)
             for actor in actors:
-                actor.visibility = here
-                if here:
+                actor.visibility = visible
+                if visible:
                     actor.user_matrix = _matrix(frame.middles[i], frame.rotations[i])
             if i in frame.moved:
                 actors[0].prop.color = FALLEN
@@ -154,7 +154,7 @@ def render(stack: Stack, path: Path, title: str = "", physics: Physics = DEFAULT
         The last frame.
 
     Raises:
-        ValueError: for another ending or a folder that is not there.
+        ValueError: for another ending or a missing folder.
     """
     check_path(path)
     if not len(stack):

@@ -1,4 +1,4 @@
-"""Options of the commands that judge packings: what the boxes really are."""
+"""Options of the commands that judge packings, for cells, densities and centres of mass."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def chosen_bodies(options: argparse.Namespace) -> Bodies:
     """Return the bodies that ``--cell``, ``--density``, ``--com-spread`` and ``--seed`` choose.
 
     Raises:
-        ValueError: for a value that cannot be.
+        ValueError: for an impossible value.
     """
     density = None if options.density is None else (options.density[0], options.density[1])
     return Bodies(options.cell, density, options.com_spread or 0.0, options.seed)

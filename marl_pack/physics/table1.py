@@ -41,7 +41,7 @@ PAPER: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Rule, seed and physics of one row of the table."""
+    """The rule, seed and physics of one row of the table."""
 
     rule: str
     seed: int = 0
@@ -50,7 +50,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Trial:
-    """One bin to its end: its n boxes, and what was judged and timed after each placement."""
+    """The record of one bin: its n boxes, and verdicts and times after each placement."""
 
     plan: Plan
     stands: NDArray[np.bool_]  # [n]          by the judge
@@ -72,7 +72,7 @@ class Timed:
         self.seconds: list[float] = []  # CPU time of each mask
 
     def __call__(self, bins: Bins, item: OrientedItem) -> Tensor:
-        """Return the rule's mask, and keep its time."""
+        """Return the rule's mask, and record its time."""
         start = time.process_time()
         mask = self.rule(bins, item)
         self.seconds.append(time.process_time() - start)
@@ -81,7 +81,7 @@ class Timed:
 
 @cache
 def _compile(settings: Settings) -> None:
-    """Compile the rule, so that no mask's time includes that."""
+    """Compile the rule, so that no mask's time includes compilation."""
     list(_play(settings, -1, Timed(make_rule(settings.rule))))
 
 

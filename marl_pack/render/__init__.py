@@ -1,1 +1,1 @@
-"""Pictures of a bin."""
+"""Pictures of a bin and its boxes."""

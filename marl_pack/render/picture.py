@@ -69,7 +69,7 @@ _Rect = tuple[float, float, float, float]  # left, bottom, width, height in frac
 
 
 def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
-    """Return what to paint from back to front, so that no box shows through another.
+    """Return the order in which to paint boxes, from back to front, so that nothing hidden shows.
 
     Box a, moved by t away from the camera in direction v, meets box b while their intervals overlap
     on every axis. With y reversed all v_k > 0, and that is for::
@@ -80,17 +80,17 @@ def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
     hides a part of b, or all are negative, and b hides a part of a.
 
     Boxes can hide one another in a ring, so they are painted by levels, one for each height at
-    which a box stands: first whatever stands on the floor, at last whatever stands highest. What is
-    above a level is hidden by nothing below it. Boxes that reach through one level are disjoint in
-    plan, and convex shapes in a plane never hide one another in a ring. So at each level those that
-    reach through it can be painted in order, each from that level up. Only those need it that stand
-    there or hide a part of something painted at this level.
+    which a box stands, from the floor upwards. A part above a level is never hidden by a part below
+    it. Boxes that reach through one level are disjoint seen from above, and convex shapes in a
+    plane never hide one another in a ring. So at each level the boxes that reach through it can be
+    painted in order, each from that level upwards. This is needed only for boxes that stand on the
+    level or hide a part of a box painted at it.
 
     Args:
         boxes: int [n, 6], rows x, y, z, w, d, h.
 
     Returns:
-        Pairs of a box's index and the height from which on it is to be painted.
+        Pairs of a box's index and the height from which upwards it is painted.
 
     Raises:
         ValueError: if boxes overlap.
@@ -107,16 +107,16 @@ def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
     order: list[tuple[int, int]] = []
     for level in np.unique(low[:, 2]).tolist():
         stands = low[:, 2] == level
-        left = (low[:, 2] <= level) & (level < high[:, 2])
+        waiting = (low[:, 2] <= level) & (level < high[:, 2])
         painted = np.zeros(len(boxes), dtype=bool)
-        while left.any():
-            following = left & ~hides[:, left].any(1)
+        while waiting.any():
+            following = waiting & ~hides[:, waiting].any(1)
             if not following.any():
-                raise ValueError(f"some of boxes {np.flatnonzero(left).tolist()} overlap")
+                raise ValueError(f"some of boxes {np.flatnonzero(waiting).tolist()} overlap")
             paint = following & (stands | hides[:, painted].any(1))
             order.extend((i, level) for i in np.flatnonzero(paint).tolist())
             painted |= paint
-            left &= ~following
+            waiting &= ~following
     return order
 
 
@@ -132,7 +132,7 @@ def draw(
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
     The box placed last has a thick outline, in the bin and on the heightmaps. The item is drawn at
-    the bin's scale, in the colour it will have, and smaller only if there is no room.
+    the bin's scale, in the colour it will have, and smaller only if there is too little space.
 
     Args:
         size: (W, D, H) in cells.
@@ -263,11 +263,11 @@ def _draw_item(
     figure: Figure, rect: _Rect, item: tuple[int, int, int], colour: str, scale: float
 ) -> None:
     """Draw the item to come in the middle of ``rect``, with its sides below."""
-    axes, shown = _axes(figure, rect, item, scale)
+    axes, own_scale = _axes(figure, rect, item, scale)
     _add_boxes(axes, np.array([(0, 0, 0, *item)]), [colour], last_edge=0.6)
     text = "item {} × {} × {}".format(*item)
-    if shown < 0.99 * scale:
-        text += f"\n(drawn at {shown / scale:.0%})"
+    if own_scale < 0.99 * scale:
+        text += f"\n(drawn at {own_scale / scale:.0%})"
     left, bottom, width, _ = rect
     figure.text(left + width / 2, bottom - 0.03, text, ha="center", va="top", size=11, color=_INK)
 
@@ -294,7 +294,7 @@ def _draw_masks(
     left, bottom, wide, high = rect[0], rect[1], rect[2] / columns, rect[3] / rows
     for i, mask in enumerate(masks):
         row, across = divmod(i, columns)
-        # Each panel leaves room for its title above and its ticks below.
+        # Each panel leaves space for its title above and its ticks below.
         axes = figure.add_axes(
             (left + across * wide, bottom + (rows - 1 - row) * high, wide - 0.025, high - 0.095)
         )
@@ -333,10 +333,10 @@ def _axes(
     axes.set_axis_off()
     corners = _project(_CORNERS * size)
     low, high = corners.min(0), corners.max(0)
-    room = np.multiply(figure.bbox.size, rect[2:])
-    scale = min(scale, float((room / (high - low)).min()))
-    left, bottom = (low + high - room / scale) / 2
-    right, top = (low + high + room / scale) / 2
+    space = np.multiply(figure.bbox.size, rect[2:])
+    scale = min(scale, float((space / (high - low)).min()))
+    left, bottom = (low + high - space / scale) / 2
+    right, top = (low + high + space / scale) / 2
     axes.set(xlim=(left, right), ylim=(bottom, top))
     return axes, scale
 

@@ -1,6 +1,6 @@
 """The judge of stacks: it builds a stack box by box in SAPIEN (PhysX) and reports what moved.
 
-It knows nothing of how a stack was packed: :class:`Stack` takes a :class:`marl_pack.plan.Plan` or
+It does not depend on how a stack was packed: :class:`Stack` takes a :class:`marl_pack.plan.Plan` or
 rows of boxes, :func:`check` judges it after its last placement and :func:`judge` after each.
 ``python -m marl_pack.sapien_check --help`` lists the commands.
 """

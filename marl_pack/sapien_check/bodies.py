@@ -1,7 +1,7 @@
-"""What packed boxes really are: their masses and centres of mass, drawn or as packed.
+"""The real masses and centres of mass of packed boxes, drawn at random or as packed.
 
-A stability rule knows the boxes by what its masks were given. Here the truth may differ: densities
-and centres of mass drawn for each item show how good a guarantee is outside its assumptions.
+A stability rule computes masks from the weights that it is given. The real ones may differ: drawn
+densities and centres of mass show how well a guarantee holds outside its assumptions.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from marl_pack.sapien_check.stack import DENSITY, Stack, cell_of, offsets_of
 
 @dataclass(frozen=True)
 class Bodies:
-    """How the boxes of a plan become bodies with a mass and a centre of mass.
+    """Settings by which boxes of a plan become bodies with a mass and a centre of mass.
 
     Raises:
-        ValueError: for a value that cannot be.
+        ValueError: for an impossible value.
     """
 
     cell: float | None = None  # metres of a unit of length; None: see stack.cell_of
@@ -28,7 +28,7 @@ class Bodies:
         None  # kg/m³, drawn between (log-uniform); None: as packed
     )
     com_spread: float = 0.0  # centre of mass drawn up to so far off, in fractions of w, d, h
-    seed: int = 0  # of what is drawn
+    seed: int = 0  # of the drawn densities and centres
 
     def __post_init__(self) -> None:
         low, high = self.density or (DENSITY, DENSITY)
@@ -56,27 +56,27 @@ class Bodies:
 
         Args:
             plan: boxes in one bin.
-            episode: number of the plan, which with the seed decides what is drawn.
+            episode: number of the plan; with the seed it decides the drawn values.
 
         Raises:
-            ValueError: naming the episode and the box, if the stack cannot be.
+            ValueError: naming the episode and the box, if the stack is impossible.
         """
         cell = cell_of(plan) if self.cell is None else self.cell
         rng = np.random.default_rng((self.seed, episode))
         low, high = self.density or (DENSITY, DENSITY)
-        drawn = np.exp(rng.uniform(np.log(low), np.log(high), len(plan)))
+        density = np.exp(rng.uniform(np.log(low), np.log(high), len(plan)))
         sides = plan.sides.astype(np.float64)
         volume = plan.weights if self.density is None else sides.prod(1)
         offset = offsets_of(plan)
         offset += rng.uniform(-self.com_spread, self.com_spread, (len(plan), 3))
-        mass = drawn * volume * cell**3
+        mass = density * volume * cell**3
         try:
             return Stack.of_plan(plan, cell=cell, mass=mass, com_offset=offset)
         except ValueError as error:
             raise ValueError(f"episode {episode}: {error}") from None
 
     def __str__(self) -> str:
-        """Return the bodies in words, empty if all is as it was packed."""
+        """Describe the bodies; empty if all are as packed."""
         words = []
         if self.density is not None:
             words.append(f"densities {self.density[0]:g} to {self.density[1]:g}")

@@ -1,6 +1,6 @@
-"""The judge: it builds a stack in SAPIEN (PhysX on the CPU) and looks whether it stands.
+"""The judge: it builds a stack in SAPIEN (PhysX on the CPU) and checks whether it stands.
 
-After each placement the boxes are put at their nominal poses and left to gravity; the stack stands
+After each placement the boxes start at their nominal poses, under gravity; the stack stands
 if none moves or rotates by more than a threshold within a second or so. Why a verdict can be
 trusted:
 
@@ -43,12 +43,12 @@ CREEP = 0.1  # share of a threshold from which on a box may be about to fall
 LONGEST = 0.3  # metres; boxes are scaled so that their longest side is the paper's longest
 THINNEST = 1 / 50  # of the longest side: below, the thresholds would be a large part of a box
 HEAVY = 100.0  # ratio of masses from which on a fall has to survive Physics.heavy as well
-HEAVIEST = 1e4  # ratio of masses; beyond, the solver is no judge
+HEAVIEST = 1e4  # ratio of masses beyond which the solver cannot be trusted
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Movement of k boxes after the last of them was placed."""
+    """The movement of k boxes after the last of them was placed."""
 
     stands: bool
     distance: Floats  # [k]  metres that each box's middle moved, in the last pass, unscaled
@@ -114,16 +114,15 @@ def _simulate(stack: Stack, physics: Physics, step: Pass, groups: list[list[int]
 def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
     """Yield the verdict after each placement, up to the first fall.
 
-    Simulated are the boxes that hang together with the one just placed, each by its contacts with
-    the next. Nothing acts on the others that did not act when they were judged, so their verdict
-    still holds.
+    Only boxes that a chain of contacts joins to the one just placed are simulated. The forces on
+    the others are those of their last verdict, which still holds.
 
     Raises:
         SimulationError: as :func:`check`.
     """
     if not len(stack):
         return
-    on = stack.scaled(LONGEST / float(stack.sides.max())).rests_on()  # as check sees it
+    on = stack.scaled(LONGEST / float(stack.sides.max())).rests_on()  # at the scale of check
     distance, angle = np.zeros(len(stack)), np.zeros(len(stack))
     for count in range(1, len(stack) + 1):
         part = np.arange(count)
@@ -142,7 +141,7 @@ def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
 
 @dataclass(frozen=True)
 class Judged:
-    """Result of judging one stack after each of its placements."""
+    """The result of judging one stack after each of its placements."""
 
     placements: int  # judged: all, or up to and with the one that fell
     fall: Verdict | None  # the last verdict, if it was a fall
@@ -151,7 +150,7 @@ class Judged:
 
 
 def judge_whole(stack: Stack, physics: Physics = DEFAULT) -> Judged:
-    """Judge a stack after each of its placements."""
+    """Judge a stack after each of its placements, and time it."""
     start = time.perf_counter()
     verdicts, error = [], None
     try:

@@ -1,4 +1,4 @@
-"""Processes that work on tasks side by side, with results in order."""
+"""Run tasks in several processes, with their results in order."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def in_order(task: Callable[[T], R], inputs: Iterable[T], processes: int) -> Ite
         waiting = deque(pool.submit(task, each) for each in islice(source, 2 * processes))
         try:
             while waiting:
-                done = waiting.popleft().result()
+                result = waiting.popleft().result()
                 waiting.extend(pool.submit(task, each) for each in islice(source, 1))
-                yield done
+                yield result
         except BrokenProcessPool as error:
-            raise SimulationError(f"a process that judges has died: {error}") from None
+            raise SimulationError(f"a process of the judge has died: {error}") from None
         finally:
             pool.shutdown(cancel_futures=True)

@@ -26,7 +26,7 @@ the boxes' masses alone."""
 
 @dataclass(frozen=True)
 class Stack:
-    """n boxes in order of placement; :meth:`of_plan` and :meth:`of_cells` check what they make."""
+    """A stack of n boxes in order of placement; :meth:`of_plan` and :meth:`of_cells` check it."""
 
     size: Floats  # [3]      the bin's inner sides, m
     low: Floats  # [n, 3]    low corner of each box, m
@@ -75,7 +75,7 @@ class Stack:
         if not (np.isfinite(cell) and cell > 0):
             raise ValueError(f"cell = {cell}: needs a positive length in metres")
         if (density is None) == (mass is None):
-            raise ValueError("give either the density (kg/m³) or the mass (kg) of the boxes")
+            raise ValueError("needs either the density (kg/m³) or the mass (kg) of the boxes")
         low, sides = rows[:, :3] * cell, rows[:, 3:] * cell
         weights = _each(density if mass is None else mass, len(rows), (), "density or mass")
         _refuse(~(np.isfinite(weights) & (weights > 0)), weights, "needs a positive mass")
@@ -113,7 +113,7 @@ class Stack:
             ValueError: as :meth:`of_cells`, or for a plan of several bins.
         """
         if len(plan.bin_sizes) != 1:
-            raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: judge each, plan.in_bin(k)")
+            raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: needs one, plan.in_bin(k)")
         if density is None and mass is None:
             mass = plan.weights
         return cls.of_cells(
@@ -148,7 +148,7 @@ class Stack:
         return self.only(slice(count))
 
     def only(self, which: slice | NDArray[np.intp]) -> Stack:
-        """Return these boxes of the stack alone, in this order."""
+        """Return the stack of the boxes ``which`` alone, in this order."""
         arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
@@ -183,19 +183,19 @@ class Stack:
 
 
 def cell_size(size: Sequence[float]) -> float:
-    """Return the metres of a cell where the bin's longest side is the paper's 0.6 m."""
+    """Return the edge of a cell in metres, if the bin's longest side is the paper's 0.6 m."""
     return PAPER_BIN / float(max(size))
 
 
 def cell_of(plan: Plan) -> float:
-    """Return the metres of a plan's unit: its own, else the paper's for a bin of that size."""
+    """Return the metres of a plan's unit; without one, that of :func:`cell_size`."""
     return cell_size(plan.bin_sizes[0]) if plan.unit_mm is None else plan.unit_mm / 1000
 
 
 def offsets_of(plan: Plan) -> Floats:
     """Return each centre of mass from its box's middle in fractions of w, d, h, [n, 3].
 
-    A plan does not say how high it lies: in the middle.
+    A plan does not say its height, so it is in the middle.
     """
     offset = np.zeros((len(plan), 3))
     offset[:, :2] = (plan.centres - plan.positions[:, :2]) / plan.sides[:, :2] - 0.5
@@ -208,7 +208,7 @@ def overlaps(low: Floats, high: Floats) -> Floats:
 
 
 def _each(value: ArrayLike | None, n: int, shape: tuple[int, ...], name: str) -> Floats:
-    """Return one value for all or one each as float64 [n, …]."""
+    """Return one value for all, or one for each, as float64 [n, …]."""
     values = np.asarray(value, np.float64)
     if values.shape not in (shape, (n, *shape)):
         raise ValueError(f"{name}: shape {values.shape}, needs {shape} or {(n, *shape)}")

@@ -1,4 +1,4 @@
-"""The SAPIEN scene: a bin with boxes at their nominal poses, gravity, and what collides with what.
+"""The SAPIEN scene of a stack: the bin, its boxes, gravity, and which bodies collide.
 
 SAPIEN is loaded when the first world is built, so that importing this module needs nothing but
 NumPy.
@@ -33,7 +33,7 @@ class Physics:
     """Settings of a simulation, and the thresholds of a fall.
 
     Raises:
-        ValueError: for a number that cannot be.
+        ValueError: for an impossible number.
     """
 
     friction: float = 0.5  # static and dynamic, between all faces
@@ -80,10 +80,10 @@ def load_sapien() -> Any:
 
 
 class World:
-    """A bin with boxes at their nominal poses, and gravity.
+    """A simulated bin with boxes at their nominal poses, under gravity.
 
     SAPIEN keeps solver settings for the whole process and takes them when a system and its bodies
-    are made: a world changes them.
+    are made, so each new world changes them.
 
     Args:
         stack: the boxes.
@@ -155,13 +155,13 @@ class World:
         self._add(body, stack.middle[i].tolist())
         return body
 
-    def set_poses(self, middles: Floats, turns: Floats) -> None:
+    def set_poses(self, middles: Floats, rotations: Floats) -> None:
         """Put the first boxes at poses in the form that :meth:`poses` returns."""
-        for body, middle, turn in zip(self.bodies, middles, turns, strict=False):
-            body.entity.set_pose(self.sapien.Pose(middle.tolist(), turn.tolist()))
+        for body, middle, rotation in zip(self.bodies, middles, rotations, strict=False):
+            body.entity.set_pose(self.sapien.Pose(middle.tolist(), rotation.tolist()))
 
     def run(self, seconds: float) -> None:
-        """Simulate so many seconds, to the nearest step."""
+        """Simulate ``seconds``, to the nearest step."""
         for _ in range(max(1, round(seconds / self.system.timestep))):
             self.system.step()
 
@@ -169,16 +169,16 @@ class World:
         """Return middles [n, 3] in metres and quaternions [n, 4], w first.
 
         Raises:
-            SimulationError: if they are no numbers, or boxes have shot away.
+            SimulationError: if a pose is not finite, or a box is over 1 km away.
         """
         poses = [body.entity_pose for body in self.bodies]
         middles = np.array([pose.p for pose in poses], np.float64).reshape(-1, 3)
-        turns = np.array([pose.q for pose in poses], np.float64).reshape(-1, 4)
-        if not (np.isfinite(middles).all() and np.isfinite(turns).all()):
+        rotations = np.array([pose.q for pose in poses], np.float64).reshape(-1, 4)
+        if not (np.isfinite(middles).all() and np.isfinite(rotations).all()):
             raise SimulationError("the simulation diverged: poses are not finite")
         if (np.abs(middles) > 1e3).any():
             raise SimulationError("the simulation diverged: a box is over 1 km away")
-        return middles, turns
+        return middles, rotations
 
     def movement(self) -> tuple[Floats, Floats]:
         """Return how far each box is from its nominal pose: metres of its middle and degrees, [n].
@@ -186,14 +186,14 @@ class World:
         Raises:
             SimulationError: as :meth:`poses`.
         """
-        middles, turns = self.poses()
+        middles, rotations = self.poses()
         # The vector part's length is the sine of half the angle: exact for small ones.
-        vector = np.linalg.norm(turns[:, 1:], axis=1)
+        vector = np.linalg.norm(rotations[:, 1:], axis=1)
         distance = np.linalg.norm(middles - self.stack.middle, axis=1)
         return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
 
     def moved(self) -> tuple[int, ...]:
-        """Return the boxes past a threshold."""
+        """Return the boxes that moved past a threshold."""
         return past(*self.movement(), self.physics)
 
 
@@ -225,10 +225,12 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     apart |= apart.T
     bit = np.full(n, -1)
     for j in np.flatnonzero(on.any(0)):
-        taken = set(bit[apart[j]].tolist())
-        bit[j] = next(b for b in range(n + 1) if b not in taken)
+        used = set(bit[apart[j]].tolist())
+        bit[j] = next(b for b in range(n + 1) if b not in used)
     if n and bit.max() >= GROUND_BIT:
-        raise SimulationError(f"{n} boxes are too many so close together for the collision groups")
+        raise SimulationError(
+            f"{n} boxes: too many so close together for {GROUND_BIT} collision groups"
+        )
     first = [1 << int(b) if b >= 0 else 0 for b in bit]
     second = [0] * n
     for i, j in np.argwhere(on):

@@ -1,4 +1,4 @@
-"""The mask of a stability rule for plain NumPy arrays, without an environment."""
+"""Compute the mask of a stability rule for NumPy arrays, without an environment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def stable_mask(
     com_offset: tuple[float, float, float] = NO_OFFSET,
     **parameters: object,
 ) -> NDArray[np.bool_]:
-    """Return where one box may be placed in one bin, for plain arrays without an environment.
+    """Return where one box may be placed in one bin, for NumPy arrays without an environment.
 
     Args:
         rule: a name in :data:`RULES`, or a rule from :func:`make_rule`.
@@ -51,15 +51,15 @@ def stable_mask(
     Raises:
         ValueError: if a map, the item, a box or a parameter is impossible; the message says which.
     """
-    heights, gaps = _check_maps(heightmap, empty_map, bin_height)
+    heights, empty = _check_maps(heightmap, empty_map, bin_height)
     sides = _check_item(item)
     bound = _bind(rule, parameters, with_boxes=boxes is not None or not heights.any())
-    stack, load = _stack(boxes, weights, heights, gaps)
+    stack, load = _stack(boxes, weights, heights, empty)
     if weight is not None and not 0 < weight < float("inf"):
         raise ValueError(f"weight {weight!r}: needs a positive number")
     bins = Bins(
         heightmap=torch.from_numpy(heights.astype(np.int16))[None],
-        empty_map=torch.from_numpy(gaps.astype(np.int16))[None],
+        empty_map=torch.from_numpy(empty.astype(np.int16))[None],
         boxes=torch.from_numpy(stack.astype(np.int16))[None],
         loads=torch.from_numpy(load)[None],
         labels=torch.full((1, len(stack), 2), UNKNOWN),
@@ -80,7 +80,7 @@ def stable_mask(
 
 
 def _whole(name: str, values: ArrayLike) -> NDArray[np.int64]:
-    """Return ``values`` as int64.
+    """Return ``values`` as whole numbers, int64.
 
     Raises:
         ValueError: if one is not a whole number.
@@ -112,17 +112,17 @@ def _check_maps(
     Raises:
         ValueError: if their shapes differ, or a number in them or the bin's size is impossible.
     """
-    heights, gaps = _whole("heightmap", heightmap), _whole("empty_map", empty_map)
-    if heights.ndim != 2 or heights.shape != gaps.shape:
+    heights, empty = _whole("heightmap", heightmap), _whole("empty_map", empty_map)
+    if heights.ndim != 2 or heights.shape != empty.shape:
         raise ValueError(
-            f"heightmap {heights.shape} and empty_map {gaps.shape}: need the same shape [W, D]"
+            f"heightmap {heights.shape} and empty_map {empty.shape}: need the same shape [W, D]"
         )
     check_size((*heights.shape, bin_height))
     if heights.min() < 0 or heights.max() > bin_height:
         raise ValueError(f"heightmap: heights must lie in 0 … {bin_height}, the bin's height")
-    if gaps.min() < 0 or (gaps > heights).any():
+    if empty.min() < 0 or (empty > heights).any():
         raise ValueError("empty_map: must lie between 0 and the column's height")
-    return heights, gaps
+    return heights, empty
 
 
 def _bind(
@@ -133,21 +133,21 @@ def _bind(
     Args:
         rule: a name or a bound rule.
         parameters: to bind to a named rule.
-        with_boxes: whether the boxes of the stack are known.
+        with_boxes: whether the boxes of the stack were given, or there are none.
 
     Raises:
-        ValueError: for parameters of a bound rule, or if the rule needs boxes that are not known.
+        ValueError: for parameters of a bound rule, or if the rule needs boxes that were not given.
     """
     bound: Callable[..., torch.Tensor]
     if isinstance(rule, str):
         bound = make_rule(rule, **parameters)
     elif parameters:
-        raise ValueError(f"{sorted(parameters)} go with the name of a rule, not with a bound one")
+        raise ValueError(f"{sorted(parameters)}: need the name of a rule, not a bound one")
     else:
         bound = rule
     function = getattr(bound, "func", bound)
     if not with_boxes and function in (lbcp, equilibrium):
-        raise ValueError("the rule looks at the whole stack: give boxes, rows x y z w d h")
+        raise ValueError("boxes: the rule needs the whole stack; give boxes, rows x y z w d h")
     if function is equilibrium:
         own: dict[str, object] = getattr(bound, "keywords", {})
         bound = make_rule("equilibrium", **({"check_stack": True} | own))
@@ -158,16 +158,16 @@ def _stack(
     boxes: ArrayLike | None,
     weights: ArrayLike | None,
     heights: NDArray[np.int64],
-    gaps: NDArray[np.int64],
+    empty: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the boxes in an order in which they can be placed, and their loads.
+    """Return the boxes, sorted so that they can be placed one by one, and their loads.
 
     Raises:
         ValueError: if a box cannot be placed, or the boxes do not make the maps.
     """
     if boxes is None:
         if weights is not None:
-            raise ValueError("weights: given without boxes")
+            raise ValueError("weights: need boxes")
         return np.zeros((0, 6), np.int64), np.zeros((0, 3))
     stack = _whole("boxes", boxes).reshape(-1, 6) if np.size(boxes) else np.zeros((0, 6), np.int64)
     order = np.argsort(stack[:, 2], kind="stable")
@@ -181,8 +181,8 @@ def _stack(
         resting_height, _ = place_box(heightmap, empty_map, x, y, w, d, h)
         if resting_height != z:
             raise ValueError(f"{name} rests at {resting_height}: it floats or overlaps another")
-    if (heightmap != heights).any() or (empty_map != gaps).any():
-        raise ValueError("boxes: they do not make this heightmap and empty_map")
+    if (heightmap != heights).any() or (empty_map != empty).any():
+        raise ValueError("boxes: need to make this heightmap and empty_map")
     load = uniform_loads(stack)
     if weights is not None:
         own_weights = np.asarray(weights, np.float64)

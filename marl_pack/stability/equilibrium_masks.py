@@ -1,9 +1,9 @@
-"""Masks of exact static equilibrium: where a box leaves the whole stack standing.
+"""Masks of exact static equilibrium: the cells where a box leaves the whole stack standing.
 
-``hull_alpha`` true is a yes (the new weight goes straight down through solid columns) and
-``hull_1`` false a no (the box itself tips); only the cells between are solved, by the reduced
-linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Where its simplex is unsure, HiGHS
-decides (:mod:`marl_pack.stability.static_equilibrium`).
+Where ``hull_alpha`` is true, the stack stands: the new weight goes straight down through filled
+columns. Where ``hull_1`` is false, it does not: the box itself tips. Only the other cells are
+solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Where its
+simplex is unsure, HiGHS decides (:mod:`marl_pack.stability.static_equilibrium`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _solve_band(
     """Write YES, NO or UNSURE to ``verdict`` [N, A, W, D] for every cell of ``band``.
 
     YES: the stack stands with every one of the ``shifts`` [S, 2] of the new box's centre of mass.
-    ``whole`` [N] says where all of the stack is solved, not only the boxes that may be disturbed.
+    ``whole`` [N]: whether all of the stack is solved, not only the boxes that may be disturbed.
     """
     n, width, depth = heightmap.shape
     scratch = np.empty((3, 2 * width + 2, 2), np.int64)
@@ -137,7 +137,7 @@ def _stands_by_highs(
     y: int,
     shifts: NDArray[np.float64],
 ) -> bool:
-    """Decide one cell by the linear program of the whole stack."""
+    """Decide one cell by HiGHS, with the linear program of the whole stack."""
     k = int(stack.count[b])
     w, d, h = item.sides[b, a].tolist()
     z = int(stack.heightmap[b, x : x + w, y : y + d].max())

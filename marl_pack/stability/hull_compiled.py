@@ -1,14 +1,15 @@
 """Convex-hull masks in compiled loops: no window is read twice (Numba).
 
-With K = 2 · height + bearing, the largest K of a window gives its resting height, and whether a
-bearing cell lies at that height, in one small integer; the contact cells that count are those with
-K equal to that maximum when it is odd. One sliding maximum of K over quarter windows, taken by
-doubling on the flattened map, answers both questions for each quadrant of every window around the
+Each column has K = 2 · height + 1 if it bears, else 2 · height. The largest K of a window gives its
+resting height, and whether a bearing cell lies at that height, in one small integer. If it is odd,
+the contact cells that count are those with K equal to it. One sliding maximum of K over quarter
+windows, by doubling on the flattened map, gives both for each quadrant of every window around the
 centre of mass:
 
 - a contact cell in all four quadrants: the centre of mass is strictly inside their hull;
-- none in two adjacent ones: all contact lies beyond a line through it, so it is not;
-- only what lies between gets the exact test on the extremes of the window's rows
+- no contact cell in two adjacent quadrants: all contact lies beyond a line through the centre of
+  mass, so it is not inside;
+- only the other windows get the exact test on the extremes of the window's rows
   (:mod:`marl_pack.stability.hull_exact`).
 
 Small maps are processed in runs of windows of the same footprint, so that the loops are long
@@ -61,14 +62,14 @@ def _decide(a: Any, b: Any, c: Any, d: Any, top: Any, code: Any) -> None:
 
 @njit(cache=True)
 def fill_levels(heightmap: Any, empty_map: Any, levels: Any) -> None:
-    """Write K of every column, from flat maps."""
+    """Write K of every column to ``levels``, from flat maps."""
     for i in range(levels.size):
         levels[i] = 2 * heightmap[i] + (1 if empty_map[i] == 0 else 0)
 
 
 @njit(cache=True)
 def _load(levels: Any, top: int, valid: Any, window: Any, tops: Any, codes: Any) -> None:
-    """Put one mask's map, height limit and valid positions into a run (slices copy slowly)."""
+    """Copy one mask's map, height limit and valid positions into a run, faster than slices."""
     for i in range(levels.size):
         window[i] = levels[i]
         tops[i] = top
@@ -77,14 +78,14 @@ def _load(levels: Any, top: int, valid: Any, window: Any, tops: Any, codes: Any)
 
 @njit(cache=True)
 def _copy(values: Any, out: Any) -> None:
-    """Copy a flat map (slices copy slowly)."""
+    """Copy a flat map, faster than by slices."""
     for i in range(out.size):
         out[i] = values[i]
 
 
 @njit(cache=True)
 def _write_mask(codes: Any, out: Any) -> bool:
-    """Write the YES of ``codes`` to ``out``; return whether any is UNDECIDED."""
+    """Write the YES of ``codes`` to ``out``; return whether any code is UNDECIDED."""
     undecided = np.uint8(0)
     for i in range(out.size):
         undecided |= codes[i] & UNDECIDED
@@ -249,7 +250,7 @@ def general_masks(
 ) -> None:  # fmt: skip
     """Compute masks for any centre of mass and safety margin.
 
-    Halves and quadrants now begin ``margin`` away from the centre of mass. Contact reaching into
+    Halves and quadrants begin ``margin`` away from the centre of mass here. Contact reaching into
     all four quadrants puts the square of half-width ``margin`` around it, and so the disc, inside
     the hull; none in one of the four halves leaves a side of the hull within ``margin`` of it.
 
@@ -289,7 +290,7 @@ def general_masks(
 
 
 def level_dtype(height: int) -> type[np.generic]:
-    """Return the smallest type that holds 2 · height + 1."""
+    """Return the smallest integer type that holds 2 · height + 1."""
     return np.uint8 if height <= 126 else np.int16
 
 

@@ -1,8 +1,8 @@
 """Convex-hull masks in batched tensor code, for any device.
 
-The same rule as :mod:`marl_pack.stability.hull_compiled`, by the same quadrants: sliding maxima by
-doubling, here as gathers since each oriented item has its own window, and an exact test of the few
-windows the quadrants leave undecided. Verdicts are equal cell by cell.
+This is the rule of :mod:`marl_pack.stability.hull_compiled`, with the same quadrants: sliding
+maxima by doubling, here as gathers because each oriented item has its own window, and an exact test
+of the few windows that the quadrants leave undecided. The verdicts are equal cell by cell.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from marl_pack.geometry import MAX_HEIGHT
 from marl_pack.geometry.tensor import cut_windows, fits, shift, slide
 
 PAIR_CELLS = 1 << 24
-"""Elements of the exact test's [windows, points, points, points] at a time."""
+"""Largest number of elements of the exact test's [windows, points, points, points] at a time."""
 
 
 def _below_chain(points: Tensor, present: Tensor, com: Tensor, margin: float) -> Tensor:

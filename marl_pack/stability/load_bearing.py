@@ -2,7 +2,7 @@
 
 A box whose centre of mass lies in a polygon of load-bearing contact can itself carry any load
 inside that polygon, so gap cells under its top may count for the next box. A cell counts only if
-its whole square lies in the polygon; asking for one corner, as a raster invites to, is unsound.
+its whole square lies in the polygon; a test of one corner alone would be unsound.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
 
 @njit(cache=True, inline="always")
 def _fill_hull(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
-    """Fill ``cells`` [w, d] up to the hull of its true squares: whole squares only."""
+    """Set all ``cells`` [w, d] whose whole square lies in the hull of the true squares."""
     w, d = cells.shape
     if cells[0, 0] and cells[0, d - 1] and cells[w - 1, 0] and cells[w - 1, d - 1]:
         cells[:] = True

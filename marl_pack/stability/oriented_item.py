@@ -14,7 +14,7 @@ from marl_pack.geometry import ORIENTATIONS, oriented
 
 @dataclass(frozen=True)
 class OrientedItem:
-    """One item per bin in A orientations. ``None`` means uniform mass (weight = volume)."""
+    """One item per bin in A orientations; without centre or weight, mass is uniform."""
 
     sides: Tensor  # int16 [N, A, 3]  w, d, h along x, y, z; a zero side: orientation not allowed
     com: Tensor | None = None  # float64 [N, A, 2]  centre of mass from the window's low corner

@@ -3,15 +3,15 @@ r"""The reduced linear program of one box placed on a stack in equilibrium, in c
 :mod:`marl_pack.stability.static_equilibrium` solves the linear program of a whole stack. A mask
 asks thousands of such questions about stacks that stand, so the program is reduced:
 
-- *Solid cells.* Where the column below a contact cell is filled to the floor, a force there can be
+- *Bearing cells.* If the column below a contact cell is filled to the floor, a force there can be
   passed straight down through the column without disturbing any box in it. Letting the ground push
   at the corners of those cells adds no wrench that the contacts could not already produce, so the
   cone is unchanged.
 - *Grounded boxes.* Call a box grounded if all columns below it are filled and all boxes it rests on
   are grounded or the floor. Let :math:`C` be the cone, :math:`C_g` the cone of the grounded boxes'
   own ground forces and :math:`C'` the cone left when grounded boxes are replaced by ground. A
-  grounded box touches others only from below, at solid cells, so deleting its rows from :math:`A`
-  turns each such contact into a ground contact: the projection of :math:`C` is :math:`C'`, and
+  grounded box touches others only from below, at bearing cells, so deleting its rows from :math:`A`
+  makes each such contact a ground contact: the projection of :math:`C` is :math:`C'`, and
   :math:`C \supseteq C_g \times C'`. Each grounded weight is interior to :math:`C_g`. Hence
   :math:`w \in \operatorname{int} C \iff w' \in \operatorname{int} C'`.
 - *Components.* Boxes that no chain of contacts through ungrounded boxes joins to the new one keep
@@ -95,7 +95,7 @@ def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing
         bearing: bool [w, d], written.
 
     Returns:
-        Whether all cells do.
+        Whether all cells of the window touch and bear.
     """
     full = True
     for i in range(bearing.shape[0]):
@@ -107,7 +107,7 @@ def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing
 
 @njit(cache=True)
 def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[Any, Any, Any]:
-    """Replay a stack: find its grounded boxes, and where the ground pushes at the others.
+    """Replay a stack to find its grounded boxes, and where the ground pushes at the others.
 
     Args:
         boxes: int64 [≥ n, 6], rows x, y, z, w, d, h in order of placement.
@@ -235,7 +235,7 @@ def stands(
     """
     members, row, forces = _component(boxes, n, grounded, count, whole)
     a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
-    force, sound = max_least_force(a, weight, 1e3 * STRICT)
-    if not sound:
+    force, reliable = max_least_force(a, weight, 1e3 * STRICT)
+    if not reliable:
         return UNSURE
     return YES if force > STRICT else NO

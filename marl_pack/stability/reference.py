@@ -1,7 +1,7 @@
-"""The meaning of every rule, one window at a time, in plain NumPy.
+"""The definition of every rule, one window at a time, in plain NumPy.
 
-Nothing here is fast. The batched code is tested cell by cell against these functions, and a
-reader finds here what a rule means. A cell is a unit square, not a point:
+Nothing here is fast. The batched code is tested cell by cell against these functions, which define
+what a rule means. A cell is a unit square, not a point:
 a support polygon is the convex hull of the corners of the contact squares, and a centre of mass
 must lie strictly inside it. ``docs/environment.md`` lists where this departs from the paper.
 """
@@ -93,8 +93,8 @@ def lbcp_bearing(size: tuple[int, int], boxes: Map) -> NDArray[np.bool_]:
     """Return the cells [W, D] whose top carries any load, by load-bearable convex polygons.
 
     The floor carries everywhere. A box carries on those cells of its top whose whole square lies
-    in the hull of the bearing squares it rests on (Gao et al. 2025, arXiv 2507.09123; asking for
-    one corner of the square instead of all four is unsound).
+    in the hull of the bearing squares it rests on (Gao et al. 2025, arXiv 2507.09123; testing only
+    one corner of the square instead of all four would be unsound).
     """
     heightmap, empty_map = np.zeros(size, np.int64), np.zeros(size, np.int64)
     bearing = np.ones(size, dtype=np.bool_)

@@ -45,7 +45,7 @@ def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """Return the mask of convexHull-α (Algorithm 1): only contact over filled columns counts.
 
     Sound for any masses and for whatever the rule places later: each weight goes straight down
-    through solid columns. Arguments as :func:`hull_1`.
+    through filled columns. Arguments as :func:`hull_1`.
     """
     return _supported(bins, item, bins.empty_map, margin)
 
@@ -80,11 +80,11 @@ def equilibrium(
 ) -> Tensor:
     """Return the mask of exact strict equilibrium of the whole stack.
 
-    See :mod:`marl_pack.stability.equilibrium_masks`. The rule relies on the weights: a stack built
-    on wrong ones may break.
+    See :mod:`marl_pack.stability.equilibrium_masks`. The rule relies on the weights: if they are
+    wrong, a stack may fall.
 
     Args:
-        bins: N bins whose stacks stand (or give ``check_stack``).
+        bins: N bins whose stacks stand; with ``check_stack`` any bins.
         item: their items in A orientations.
         margin: the centre of mass may lie anywhere within so many cells of its place.
         check_stack: whether to check that the stacks stand instead of assuming it.
@@ -119,10 +119,10 @@ def make_rule(name: str, **parameters: object) -> Rule:
     """
     if name not in RULES:
         raise ValueError(f"unknown stability rule {name!r}: one of {', '.join(RULES)}")
-    known = list(inspect.signature(RULES[name]).parameters)[2:]
+    accepted = list(inspect.signature(RULES[name]).parameters)[2:]
     for key in parameters:
-        if key not in known:
-            raise ValueError(f"rule {name!r} has no parameter {key!r}: it takes {known}")
+        if key not in accepted:
+            raise ValueError(f"rule {name!r} has no parameter {key!r}: needs one of {accepted}")
     margin: Any = parameters.get("margin", 0.0)
     number = not isinstance(margin, bool) and isinstance(margin, Real)
     if not number or not 0 <= margin < math.inf:

@@ -29,7 +29,7 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     """Minimise the last row's objective by the simplex method, until it is below ``-enough``.
 
     Largest coefficient first, and among tied rows (the moments' right-hand sides are all 0) the
-    largest pivot, which keeps the numbers sound; Bland's rule once that might cycle.
+    largest pivot, which keeps the numbers accurate; Bland's rule once that might cycle.
 
     Returns:
         Whether it ended within the limit on iterations.
@@ -68,7 +68,7 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
 
 @njit(cache=True)
 def _solution(table: Any, basis: Any, a: Any, weight: Any) -> tuple[float, float, float]:
-    """Read the solution from a tableau and put it back into the equations.
+    """Read the solution from a tableau, and check it in the equations.
 
     Returns:
         t, the sum of the equations' absolute errors, and the least force.
@@ -92,7 +92,7 @@ def _solution(table: Any, basis: Any, a: Any, weight: Any) -> tuple[float, float
 
 @njit(cache=True)
 def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
-    """Solve ``max t, a f = weight, f ≥ t``.
+    """Solve the linear program ``max t, a f = weight, f ≥ t``.
 
     Args:
         a: float64 [R, m], of full row rank.
@@ -114,7 +114,7 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
         table[i, columns + 1] = weight[i]
         basis[i] = columns + 1 + i  # an artificial variable, never stored
         table[rows] -= table[i]
-    sound = _optimise(table, basis, columns + 1, np.inf)
+    reliable = _optimise(table, basis, columns + 1, np.inf)
     missing = -table[rows, columns + 1]
     feasible = missing <= 1e-9
     if feasible:
@@ -127,15 +127,15 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
                 if abs(table[i, best]) > 1e-9:
                     _pivot(table, basis, i, best)
                 else:
-                    sound = False
+                    reliable = False
         table[rows] = 0.0
         table[rows, columns] = -1.0
         for i in range(rows):
             if basis[i] == columns:
                 table[rows] += table[i]
-        sound = _optimise(table, basis, columns + 1, enough) and sound
+        reliable = _optimise(table, basis, columns + 1, enough) and reliable
         missing = 0.0
 
     t, lacking, least = _solution(table, basis, a, weight)
-    sound = sound and abs(lacking - missing) < 1e-7 and least > -1e-9
-    return (t if feasible else -np.inf), sound
+    reliable = reliable and abs(lacking - missing) < 1e-7 and least > -1e-9
+    return (t if feasible else -np.inf), reliable

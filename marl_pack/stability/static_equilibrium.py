@@ -20,7 +20,7 @@ from scipy.sparse import csc_array
 
 STRICT = 1e-9
 """Least force, in mean weights of the stack, that counts as positive. Sizes are small integers, so
-true optima are either 0 up to rounding or larger by orders of magnitude; ``tests`` hold the gap.
+true optima are either 0 up to rounding or larger by orders of magnitude; the tests check this gap.
 HiGHS balances to 1e-7: weights that differ by more than ten million times are beyond it."""
 
 

@@ -1,6 +1,6 @@
 """The support area rule (Zhao et al. 2021): enough of a box's bottom face and enough corners.
 
-The rule is not sound: it ignores the centre of mass, and all that lies below the box that carries.
+The rule is not sound: it ignores the centre of mass, and everything below the box that carries.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _fill_masks(
 
 
 def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
-    """Compute the masks in compiled loops.
+    """Compute the masks of the rule in compiled loops.
 
     Args:
         heightmap: int16 [N, W, D].
@@ -91,7 +91,7 @@ def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thr
 
 
 def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
-    """Compute the masks in tensor code; arguments as :func:`mask_compiled`.
+    """Compute the masks of the rule in tensor code; arguments as :func:`mask_compiled`.
 
     The cells at each level are counted by a summed-area table.
     """

@@ -1,1 +1,1 @@
-"""A training run: assembled from its settings, its folder, and its progress on the terminal."""
+"""A training run: its assembly from settings, its folder and its display on the terminal."""

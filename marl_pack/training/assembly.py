@@ -1,4 +1,4 @@
-"""A training run from its settings: the games, the agents and the runner."""
+"""Assemble a training run from its settings: the games, the agents and the runner."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from marl_pack.vec_env import PackingVecEnv
 
 
 def rank() -> int:
-    """Return this process's number among those that torchrun started; 0 alone."""
+    """Return this process's number among those of torchrun; 0 if it is the only one."""
     return int(os.environ.get("RANK", "0"))
 
 
@@ -40,16 +40,16 @@ def local_device(config: Config) -> str:
 
 
 def derived_seed(*parts: int) -> int:
-    """Return a seed of its own for each process; none that a user would give to an evaluation."""
+    """Derive a seed from numbers, beyond the range from which users choose seeds."""
     low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
     return int(high >> 1) << 32 | int(low)
 
 
 def make_stream(config: Config) -> Stream:
-    """Return the items of the game.
+    """Return the item stream of the game.
 
     Raises:
-        ConfigError: if they do not go with the bin.
+        ConfigError: if the stream cannot bring items for this bin.
     """
     game = config.game
     try:
@@ -61,7 +61,7 @@ def make_stream(config: Config) -> Stream:
 def make_game(
     config: Config, n: int, seed: int, *, auto_reset: bool, device: str, first_episode: int = 0
 ) -> Packing:
-    """Return G = ``n`` games as the settings say."""
+    """Return G = ``n`` games with the options of the settings."""
     return Packing(
         n, items=make_stream(config), spec=config.game, auto_reset=auto_reset, device=device,
         seed=seed, first_episode=first_episode,
@@ -85,7 +85,7 @@ def other_agents(
         checkpoint: of the run to resume, which holds them; a teacher only while it is cloned.
 
     Raises:
-        ConfigError: naming the key, if an agent is not to be had.
+        ConfigError: naming the key, if an agent cannot be loaded.
     """
     records: dict[str, dict[str, Any]] = {"policy": {}, "teacher": {}}
     for name, agent in agents_of(config).items():
@@ -108,7 +108,7 @@ def other_agents(
 def runner_settings(
     config: Config, frozen: Mapping[str, Any], teachers: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what :class:`marl_pack.agents.learning.runner.Runner` takes, from the settings.
+    """Return the configuration of :class:`marl_pack.agents.learning.runner.Runner`.
 
     Args:
         config: the settings.
@@ -167,12 +167,12 @@ def make_runner(
 
     Args:
         config: the settings.
-        folder: of the run; None keeps no files.
+        folder: of the run; None writes no files.
         checkpoint: of the run to resume.
         **reports: ``evaluate``, ``show`` and ``evaluated`` of the runner.
 
     Raises:
-        ConfigError: if a setting cannot be.
+        ConfigError: if a setting is impossible.
     """
     device = local_device(config)
     try:
@@ -213,7 +213,7 @@ def make_runner(
 
 
 def check_symmetry(config: Config, game: Packing) -> None:
-    """Refuse augmentation by symmetries where items may take o but not o ^ 1.
+    """Refuse augmentation by symmetries if an item may take orientation o but not o ^ 1.
 
     Raises:
         ConfigError: naming the orientations of such items.
@@ -227,7 +227,7 @@ def check_symmetry(config: Config, game: Packing) -> None:
 
 
 def evaluation(config: Config, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Play the held-out sequences with a checkpoint's agents, each taking its best action."""
+    """Play held-out sequences with a checkpoint's agents; return the figures of utilization."""
     device = local_device(config)
     policy = Loader(device, config.evaluation.seed).policy_of(checkpoint)
 

@@ -1,4 +1,4 @@
-"""Progress of a training run on the terminal."""
+"""Show the progress of a training run on the terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUIET_SECONDS = 30.0  # between lines of progress where the output is not a term
 
 
 class Display:
-    """Shows progress on the terminal: a bar where there is one, else a line now and then."""
+    """The progress of a run: a bar on a terminal, else a line every 30 seconds."""
 
     def __init__(self, console: Console, total: int, done: int) -> None:
         self.console, self.total = console, total
@@ -35,7 +35,7 @@ class Display:
         self.shown_at = 0.0
 
     def show(self, progress: Progress) -> None:
-        """Show an iteration that is done."""
+        """Show the figures of one iteration."""
         lines = self.lines(progress)
         self.bar.update(self.task, completed=progress.iteration)
         self.text.plain = "\n".join(lines)
@@ -53,19 +53,19 @@ class Display:
     @staticmethod
     def lines(progress: Progress) -> list[str]:
         """Return speed, utilization and reward; then each learner's entropy and KL divergence."""
-        shown = [f"{progress.items_per_second:,.0f} items/s"]
+        figures = [f"{progress.items_per_second:,.0f} items/s"]
         if not math.isnan(progress.utilization):
-            shown.append(f"util {100 * progress.utilization:.1f} %")
+            figures.append(f"util {100 * progress.utilization:.1f} %")
         if not math.isnan(progress.reward):
-            shown.append(f"reward {progress.reward:.3f}")
-        learned = []
+            figures.append(f"reward {progress.reward:.3f}")
+        learners = []
         for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses if "/" in key):
             entropy, kl = (progress.losses[f"{name}/{what}"] for what in ("entropy", "kl"))
-            learned.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
-        return ["  ".join(shown), "  ".join(learned)]
+            learners.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
+        return ["  ".join(figures), "  ".join(learners)]
 
     def evaluated(self, row: Mapping[str, Any]) -> None:
-        """Show an evaluation that is done."""
+        """Show the result of one evaluation."""
         spread = "" if row["low"] is None else f" ± {50 * (row['high'] - row['low']):.2f}"
         self.console.print(
             f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "

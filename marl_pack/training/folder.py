@@ -1,4 +1,4 @@
-"""The folder of a training run: what is written there, and how a run is resumed from it."""
+"""The folder of a training run: its files, and resuming a run from it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
 
 
 def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
-    """Write the evaluations as CSV."""
+    """Write the history of evaluations as CSV."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(history[-1]))
     writer.writeheader()
@@ -34,7 +34,7 @@ def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
-    """Write the settings, and the versions that ran them, beside the checkpoints."""
+    """Write the settings, the command and the packages' versions beside the checkpoints."""
     text = yaml.safe_dump(config.to_dict(), sort_keys=False)
     write_atomically(folder / "config.yaml", lambda file: file.write(text.encode()))
     versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
@@ -48,7 +48,7 @@ def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None
         "processes": int(os.environ.get("WORLD_SIZE", "1")),
         "versions": versions,
     }
-    if before is not None:  # gone on with: keep how it began
+    if before is not None:  # the run is resumed: keep the record of its start
         before.setdefault("resumed", []).append(record)
         record = before
     record_text = json.dumps(record, indent=2) + "\n"
@@ -59,7 +59,7 @@ def new_folder(config: Config) -> Path:
     """Make the folder of a new run and return it; no two runs share one.
 
     Raises:
-        ConfigError: if there is something in it, or it cannot be made.
+        ConfigError: if the folder exists or cannot be made.
     """
     name = config.output.name
     if name is None:
@@ -67,12 +67,12 @@ def new_folder(config: Config) -> Path:
     folder = Path(config.output.folder) / name
     if (folder / checkpoints.LATEST).exists():
         raise ConfigError(
-            f"output.name: {folder} holds a run; --resume {folder} goes on with it; or name another"
+            f"output.name: {folder} holds a run; --resume {folder} continues it; or name another"
         )
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
-        raise ConfigError(f"output.name: {folder} is there already; name another") from None
+        raise ConfigError(f"output.name: {folder} exists already; name another") from None
     except OSError as error:
         raise ConfigError(f"output.folder: {error}") from None
     return folder
@@ -82,7 +82,7 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
     """Return the settings and the latest checkpoint of a run to resume.
 
     Raises:
-        ConfigError, ValueError, FileNotFoundError: if it cannot be resumed so.
+        ConfigError, FileNotFoundError: if the run cannot be resumed with these arguments.
     """
     folder = Path(run)
     try:
@@ -92,7 +92,7 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
     own = from_dict(checkpoint["config"])
     config, options = parse(["--config", yaml.safe_dump(own.to_dict()), *arguments])
     if len(options.config or []) > 1:
-        raise ConfigError("--resume: the run has its own settings; give no --config beside it")
+        raise ConfigError("--resume: needs no --config, as the run has its own settings")
     before, after = _flat(own.to_dict()), _flat(config.to_dict())
     for key, value in after.items():
         if value != before[key] and not key.startswith(MAY_CHANGE):
@@ -109,7 +109,7 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by dotted keys."""
+    """Return nested settings in one dict with dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, dict):

@@ -1,1 +1,1 @@
-"""What a placement leaves behind, and its value."""
+"""Afterstates: the bin after each legal placement, its features and its value."""

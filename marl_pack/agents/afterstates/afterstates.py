@@ -1,10 +1,9 @@
-"""What each placement would leave for the boxes that may come next.
+"""Compute where the next boxes could be placed after each legal placement.
 
-For every legal window of the visible item, the item is placed there hypothetically, and
-``hull_alpha`` gives the cells where the boxes that may come next could then be placed: every box
-whose sides are of given lengths. From the number of cells of each box follow the mean number of
-feasible cells, and the probability that the next item has a feasible cell at all, each box being
-equally probable.
+The visible item is placed hypothetically at every legal cell. Then ``hull_alpha`` gives the cells
+where the boxes that may come next could be placed: all boxes whose sides have certain lengths. The
+number of cells of each box gives the mean number of feasible cells, and the probability that the
+next item has a feasible cell at all, each box being equally probable.
 
 Compiled loops use as many threads as torch has; tensor code gives the same numbers.
 """
@@ -32,15 +31,15 @@ from marl_pack.geometry.tensor import footprint, place_boxes
 from marl_pack.stability import hull_compiled, hull_tensor
 
 MOST_LENGTHS = 5
-"""Largest number of lengths of which the sides of boxes are made."""
+"""Largest number of different lengths that the sides of the next boxes have."""
 SHARES = 10
 """Heights are distinguished by tenths of the bin's height."""
 STEPS = 6
 """Number of kinds of steps between neighbouring columns that are distinguished."""
 SURFACE = SHARES + 1 + STEPS
-"""Numbers that :attr:`Afterstates.surface` has for each placement."""
+"""Number of entries of :attr:`Afterstates.surface` for each placement."""
 AT_ONCE = 1 << 20
-"""Cells of masks computed at once."""
+"""Number of cells of the masks that are computed at once."""
 PER_THREAD = 256
 """Number of placements from which on several threads share the work."""
 
@@ -53,7 +52,7 @@ def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Afterstates:
-    """What K legal placements would leave. Placements that are equal may share a row."""
+    """The bins after K legal placements; equal placements may share a row."""
 
     index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere of any
     counts: Tensor  # int32 [K, L, L, L]  cells where each box could be placed: w, d, h
@@ -62,7 +61,7 @@ class Afterstates:
     volume: Tensor  # int64 [K]           of the placed box, in cells
     waste: Tensor  # int64 [K]            cells that it would enclose
     filled: Tensor  # int64 [K]           cells filled in the bin with it
-    backend: Backend  # which code computes what depends on these
+    backend: Backend  # computes what is derived from these
 
     def select(self, which: Tensor) -> Afterstates:
         """Return the afterstates of the bins ``which``, int64 [B]; the rows stay the same."""
@@ -104,13 +103,13 @@ class Afterstates:
 
 
 def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Afterstates:
-    """Compute what each legal placement would leave.
+    """Compute the afterstate of each legal placement.
 
     Args:
         bins: N bins.
         sides: int16 [N, A, 3], the item's sides along x, y, z in A orientations.
         mask: bool [N, A, W, D], where it may be placed.
-        lengths: ascending; what may come next has sides of these L lengths.
+        lengths: the L lengths of the next boxes' sides, ascending.
     """
     code = bins.backend.pick(compiled=afterstates_by_compiled_loops, tensor=_tensor)
     return code(bins, sides, mask, tuple(lengths))

@@ -1,11 +1,11 @@
-"""Feasible cells on floors of at most 128 cells: sets of cells as the bits of two words.
+"""Count feasible cells on floors of at most 128 cells, with sets of cells as bits of two words.
 
 Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit shifted by whole numbers,
 and the corners of all windows that hold a cell of a set are the union of that set's shifts. The
-quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compiled`) is computed here on sets:
-level by level, the windows without anything higher in which each quadrant around the middle, or
-only each half, holds a bearing cell of that level. Corners whose windows reach over a row's end are
-left out.
+quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compiled`) is computed here on sets,
+level by level. It looks for windows without a higher cell in which each quadrant around the middle
+holds a bearing cell of that level; windows in which only each half does get the exact test. Corners
+whose windows reach over a row's end are left out.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ STEEPEST = 1e6
 
 
 def fit_in_words(width: int, depth: int) -> bool:
-    """Return whether a floor's cells fit into two words, and those of a row into one."""
+    """Return whether two words can hold a floor's cells, and one word those of a row."""
     return width * depth <= MOST_CELLS and depth <= MOST_CELLS // 2
 
 
 @njit(cache=True, inline="always")
-def _later(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
-    """Shift a set down by 0 … 127 bits: bit i of the result is bit i + ``bits`` of the set."""
+def _shift(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
+    """Shift a set right by 0 … 127 bits: bit i of the result is bit i + ``bits`` of the set."""
     if bits >= 64:
         return high >> uint64(bits - 64), uint64(0)
     if bits == 0:
@@ -37,7 +37,7 @@ def _later(low: Any, high: Any, bits: int) -> tuple[Any, Any]:
 
 
 @njit(cache=True, inline="always")
-def _size(word: Any) -> int:
+def _count_bits(word: Any) -> int:
     """Return how many bits of a word are 1."""
     word = word - ((word >> uint64(1)) & uint64(0x5555555555555555))
     word = (word & uint64(0x3333333333333333)) + ((word >> uint64(2)) & uint64(0x3333333333333333))
@@ -63,7 +63,7 @@ def _window(depth: int, x: int, y: int, w: int, d: int) -> tuple[Any, Any]:
 def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
     """Unite ``grown`` [2] with ``source`` [2] shifted by ``first`` … ``end`` - 1 strides."""
     for step in range(first, end):
-        low, high = _later(source[0], source[1], step * stride)
+        low, high = _shift(source[0], source[1], step * stride)
         grown[0] |= low
         grown[1] |= high
 
@@ -89,17 +89,17 @@ def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
 
 
 @njit(cache=True, inline="always")
-def _first(word: Any) -> int:
-    """Return the lowest bit that is 1."""
-    return _size((word & (~word + uint64(1))) - uint64(1))
+def _lowest_bit(word: Any) -> int:
+    """Return the index of the lowest bit that is 1."""
+    return _count_bits((word & (~word + uint64(1))) - uint64(1))
 
 
 @njit(cache=True, inline="always")
-def _last(word: Any) -> int:
-    """Return the highest bit that is 1."""
+def _highest_bit(word: Any) -> int:
+    """Return the index of the highest bit that is 1."""
     for step in (1, 2, 4, 8, 16, 32):
         word |= word >> uint64(step)
-    return _size(word) - 1
+    return _count_bits(word) - 1
 
 
 @njit(cache=True)
@@ -137,12 +137,12 @@ def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> 
         while remaining:
             lowest = remaining & (~remaining + uint64(1))
             remaining ^= lowest
-            corner = 64 * word + _size(lowest - uint64(1))
+            corner = 64 * word + _count_bits(lowest - uint64(1))
             up_left, up_right, down_left, down_right = -np.inf, -np.inf, -np.inf, -np.inf
             for x in range(w):
-                bits = _later(cells[0], cells[1], corner + x * depth)[0] & row
+                bits = _shift(cells[0], cells[1], corner + x * depth)[0] & row
                 if bits:
-                    top, bottom = _last(bits), d - 1 - _first(bits)
+                    top, bottom = _highest_bit(bits), d - 1 - _lowest_bit(bits)
                     up_left = max(up_left, rises[x, top, 0])
                     up_right = max(up_right, rises[x, top, 1])
                     down_left = max(down_left, rises[x, bottom, 0])
@@ -158,7 +158,7 @@ def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> 
 
 @njit(cache=True)
 def _window_tables(lengths: Any, width: int, depth: int) -> tuple[Any, Any]:
-    """Build what depends only on a window's size, for the lengths that fit on the floor.
+    """Build the tables that depend only on a window's size, for lengths up to the floor's sides.
 
     Returns:
         The corners of the windows that lie on the floor, uint64 [I, J, 2], and the rises in them
@@ -214,8 +214,8 @@ def count_by_bits(
     levels = np.empty((most, 2, 2), np.uint64)  # of each level: bearing cells, all cells
     quarters = np.empty((reach_w + 1, reach_d + 1, 2), np.uint64)
     above, undecided = np.empty(2, np.uint64), np.empty(2, np.uint64)
-    deep = np.empty((fit_d, 2), np.uint64)  # corners below which something is higher, in a row
-    blocked = np.empty((fit_d, 2), np.uint64)  # and in all rows so far
+    deep = np.empty((fit_d, 2), np.uint64)  # corners of windows whose first row has a higher cell
+    blocked = np.empty((fit_d, 2), np.uint64)  # corners of windows with a higher cell
     for k in range(heightmaps.shape[0]):
         _levels(heightmaps[k], empty_maps[k], levels)
         counts[k] = 0
@@ -244,9 +244,9 @@ def count_by_bits(
                         half_d = (lengths[j] + 1) // 2
                         along = lengths[j] - half_d
                         a_low, a_high = quarters[half_w, half_d]
-                        b_low, b_high = _later(a_low, a_high, along)
-                        c_low, c_high = _later(a_low, a_high, across)
-                        d_low, d_high = _later(a_low, a_high, across + along)
+                        b_low, b_high = _shift(a_low, a_high, along)
+                        c_low, c_high = _shift(a_low, a_high, across)
+                        d_low, d_high = _shift(a_low, a_high, across + along)
                         low, undecided[0] = _decide_word(free_low, a_low, b_low, c_low, d_low)
                         high, undecided[1] = _decide_word(free_high, a_high, b_high, c_high, d_high)
                         if undecided[0] | undecided[1]:
@@ -255,7 +255,7 @@ def count_by_bits(
                                 rises[i, j],
                             )  # fmt: skip
                             low, high = low | more_low, high | more_high
-                        feasible = _size(low) + _size(high)
+                        feasible = _count_bits(low) + _count_bits(high)
                         for tall in range(fit if feasible else 0):
                             counts[k, i, j, tall] += feasible
             above[0] |= levels[level, 1, 0]

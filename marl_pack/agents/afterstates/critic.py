@@ -2,8 +2,8 @@
 
 An afterstate is the bin with the item placed and the next one not yet seen (Sutton & Barto 2018,
 sec. 6.8). The critic estimates the return that is still to come from an afterstate's features
-(:mod:`marl_pack.agents.afterstates.features`). It learns from the agents' own returns, the reward
-of the placement subtracted, beside their PPOs.
+(:mod:`marl_pack.agents.afterstates.features`). It learns from the agents' own returns without the
+reward of the placement itself, once for each update of their PPOs.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from marl_pack.game.packing import Packing
 
 HIDDEN = 64
 REMEMBERED = 1 << 16
-"""Afterstates that it learns from, of the last rollouts."""
+"""Number of afterstates, of the last rollouts, from which the critic learns."""
 PASSES, MINIBATCH = 16, 512
-"""How often it learns from an afterstate, on average, and from how many at once."""
+"""How often the critic learns from an afterstate, on average, and from how many at once."""
 
 
 class AfterstateCritic(nn.Module):
-    """Features of afterstates [K, :data:`FEATURES`] → the return still to come [K]."""
+    """A network that estimates the return still to come from features of afterstates."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -39,20 +39,20 @@ class AfterstateCritic(nn.Module):
         )  # fmt: skip
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Estimate the values, float32 [K]."""
+        """Estimate the values, float32 [K], from features [K, :data:`FEATURES`]."""
         value: Tensor = self.layers(inputs).squeeze(1)
         return value
 
 
 class AfterstateLearner:
-    """Fits the critic to the returns that the placements of the last rollouts had.
+    """The learner that fits the critic to the returns of recent placements.
 
-    A placement's return is mostly chance, so the critic learns from many placements: from about
-    :data:`REMEMBERED`, chosen by agents nearly as they are now.
+    A placement's return is mostly chance, so the critic learns from many placements: about
+    :data:`REMEMBERED` of the last rollouts, in which the agents were nearly as they are now.
 
     Args:
         critic: the critic.
-        lookahead: which computes the afterstates.
+        lookahead: computes the afterstates.
         steps, games: T and G of a rollout.
     """
 
@@ -70,7 +70,7 @@ class AfterstateLearner:
         self.rollouts, self.step = 0, 0  # recorded so far, and steps of the next one
 
     def record(self, game: Packing, orientation: Tensor, cell: Tensor) -> None:
-        """Store the afterstates of the placements that are now played, int64 [G] each."""
+        """Store the afterstates of the chosen placements, int64 [G] each; call before placing."""
         afterstates = self.lookahead.afterstates(game)
         rows = Moves.gather(afterstates.index, orientation, cell)
         position = self.rollouts % self.capacity, self.step
@@ -81,13 +81,13 @@ class AfterstateLearner:
     def learn(
         self, returns: Tensor, rewards: Tensor, learning_rate: float, processes: int = 1
     ) -> float:
-        """Fit the critic once the rollout that was recorded has ended.
+        """Fit the critic to the recorded rollouts, at the end of each.
 
         Args:
             returns: float32 [T, G, 1], of each placement, its reward included.
             rewards: float32 [T, G, 1].
             learning_rate: of this update.
-            processes: that learn together, whose gradients are averaged.
+            processes: number of processes that learn together and average their gradients.
 
         Returns:
             The mean squared error.
@@ -96,14 +96,16 @@ class AfterstateLearner:
             ValueError: unless a whole rollout has been recorded.
         """
         if self.step != self.inputs.shape[1]:
-            raise ValueError(f"{self.step} steps recorded, a rollout has {self.inputs.shape[1]}")
+            raise ValueError(
+                f"{self.step} steps recorded: needs a rollout's {self.inputs.shape[1]}"
+            )
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.targets[self.rollouts % self.capacity] = (returns - rewards).squeeze(-1)
         self.rollouts, self.step = self.rollouts + 1, 0
-        known = min(self.rollouts, self.capacity)
-        inputs, targets = self.inputs[:known].flatten(0, 2), self.targets[:known].flatten()
-        legal = self.legal[:known].flatten().float()
+        stored = min(self.rollouts, self.capacity)
+        inputs, targets = self.inputs[:stored].flatten(0, 2), self.targets[:stored].flatten()
+        legal = self.legal[:stored].flatten().float()
         total = torch.zeros((), device=inputs.device)
         updates = -(-PASSES * returns.numel() // MINIBATCH)
         for _ in range(updates):
@@ -124,14 +126,14 @@ class AfterstateLearner:
         return float(total) / updates
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the recorded rollouts, to go on from."""
-        known = min(self.rollouts, self.capacity)
+        """Return copies of the recorded rollouts, to resume from."""
+        stored = min(self.rollouts, self.capacity)
         names = ("inputs", "targets", "legal")
-        recorded = {name: getattr(self, name)[:known].clone() for name in names}
+        recorded = {name: getattr(self, name)[:stored].clone() for name in names}
         return recorded | {"rollouts": self.rollouts}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` returned."""
+        """Restore the rollouts that :meth:`state_dict` returned."""
         for name in ("inputs", "targets", "legal"):
             getattr(self, name)[: len(state[name])] = state[name]
         self.rollouts = state["rollouts"]

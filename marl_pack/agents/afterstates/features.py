@@ -1,4 +1,4 @@
-"""The features of afterstates that their critic sees."""
+"""The features of afterstates that the critic observes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) 
 
     They are the filled share of the bin and its square; the logarithms of the numbers of cells
     where each box that may come could be placed, one number for a footprint and the same footprint
-    rotated by 90°; and the surface. None of them changes when the bin is mirrored or rotated. Boxes
-    of fewer than :data:`MOST_LENGTHS` lengths take the places of the longest.
+    rotated by 90°; and the surface. None of them changes when the bin is mirrored or rotated. If
+    boxes have fewer than :data:`MOST_LENGTHS` lengths, these take the places of the longest.
 
     Args:
         afterstates: what placements leave.
         volume: W · D · H.
-        rows: int64 [K], of these placements alone.
+        rows: int64 [K], the placements to describe; all by default.
     """
     counts, surface, filled = afterstates.counts, afterstates.surface, afterstates.filled
     if rows is not None:
@@ -35,8 +35,8 @@ def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) 
     w, _ = torch.triu_indices(MOST_LENGTHS, MOST_LENGTHS, device=counts.device)
     values = torch.zeros(len(counts), FEATURES, device=counts.device)
     boxes = values[:, 2 : 2 + PAIRS * MOST_LENGTHS].view(-1, PAIRS, MOST_LENGTHS)
-    known = (w >= first).nonzero().squeeze(1)  # in the order of i, j
-    boxes[:, known, first:] = both[:, i, j].float().log1p() / 2
+    used = (w >= first).nonzero().squeeze(1)  # in the order of i, j
+    boxes[:, used, first:] = both[:, i, j].float().log1p() / 2
     share = filled.float() / volume
     values[:, 0], values[:, 1] = share, share.square()
     values[:, 2 + PAIRS * MOST_LENGTHS :] = 2 * surface

@@ -1,7 +1,7 @@
-"""What placements leave and how good that is, computed once a turn for all agents of a player.
+"""Afterstates of the legal placements and their values, computed once a turn.
 
-A player owns a :class:`Lookahead`; its agents share it. Neither the game nor the environment knows
-of it.
+A player owns a :class:`Lookahead` that its agents share. The game and the environment do not use
+it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from marl_pack.game.packing import Packing
 T = TypeVar("T")
 
 ILLEGAL = -1e6
-"""Value of a placement that is not legal: less than any that is."""
+"""Value of an illegal placement, less than that of any legal one."""
 AT_ONCE = 1 << 15
-"""Afterstates that the critic values at once, at most."""
+"""Largest number of afterstates that the critic values at once."""
 
 
 class Memo:
-    """Results that are computed once a turn, for one turn of one game at a time."""
+    """A store of results that are computed once a turn, for one turn at a time."""
 
     def __init__(self) -> None:
         self._turn: object = None
@@ -41,7 +41,7 @@ class Memo:
         return result
 
     def forget(self, name: Any) -> None:
-        """Drop a result, to be computed again when it is next needed."""
+        """Drop a result, so that it is computed again when it is needed."""
         self._results.pop(name, None)
 
     def follow(self, game: Packing, games: Tensor, branched: Packing) -> None:
@@ -62,14 +62,14 @@ class Value(Protocol):
 
 
 class Lookahead:
-    """What the legal placements of the visible items would leave, and its value.
+    """The afterstates of the visible items' legal placements, and their values.
 
-    All results cover boxes with sides between the shortest and longest of the game's stream, and
-    ask ``hull_alpha`` where they could be placed, whatever the game's own rule.
+    The next boxes are those with sides between the shortest and longest of the game's stream.
+    ``hull_alpha`` decides where they could be placed, whatever the game's own rule is.
 
     Args:
-        critic: which estimates values of afterstates; None where nobody asks for them.
-        memo: which keeps the results; shared by players that look at the same games.
+        critic: estimates the values of afterstates; None if no agent sees them.
+        memo: stores the results; shared by players of the same games.
     """
 
     def __init__(self, critic: Value | None = None, memo: Memo | None = None) -> None:
@@ -77,7 +77,7 @@ class Lookahead:
         self.memo = memo or Memo()
 
     def afterstates(self, game: Packing) -> Afterstates:
-        """Compute what each legal placement would leave."""
+        """Compute the afterstate of each legal placement."""
 
         def compute() -> Afterstates:
             sides = game.orient_item(game.items).sides
@@ -86,10 +86,10 @@ class Lookahead:
         return self.memo.once(game, "afterstates", compute)
 
     def feasible_cells(self, game: Packing) -> Tensor:
-        """Compute in how many cells, on average, a box that may come could be placed afterwards.
+        """Compute the mean number of cells where the next box could be placed after each placement.
 
         Returns:
-            Float32 [G, 6, W, D] for each placement; 0 where it is not legal.
+            Float32 [G, 6, W, D]; 0 where the placement is not legal.
         """
 
         def compute() -> Tensor:
@@ -99,7 +99,7 @@ class Lookahead:
         return self.memo.once(game, "feasible_cells", compute)
 
     def feasible_probability(self, game: Packing) -> Tensor:
-        """Compute how probable it is that the next item has a legal place after each placement.
+        """Compute the probability that the next item has a feasible cell after each placement.
 
         Each box between the shortest and longest side of the stream is equally probable, in the
         orientations that the stream's items may take.
@@ -116,7 +116,7 @@ class Lookahead:
         return self.memo.once(game, "feasible_probability", compute)
 
     def afterstate_value(self, game: Packing) -> Tensor:
-        """Estimate the return from each placement on: its reward (Eq. 5) and the critic's value.
+        """Estimate the return of each placement: its reward (Eq. 5) plus the critic's value.
 
         Returns:
             Float32 [G, 6, W, D]; :data:`ILLEGAL` where the placement is not legal.
@@ -143,7 +143,7 @@ class Lookahead:
         return self.memo.once(game, ("afterstate_value", critic), compute)
 
     def heightmap(self, game: Packing) -> Tensor:
-        """Return a copy of the heightmaps int16 [G, W, D] that stays as it is."""
+        """Return a copy of the heightmaps int16 [G, W, D], which later placements do not change."""
         return self.memo.once(game, "heightmap", game.bins.heightmap.clone)
 
     def forget_values(self) -> None:
@@ -151,7 +151,7 @@ class Lookahead:
         self.memo.forget(("afterstate_value", self.critic))
 
     def branch(self, game: Packing, games: Tensor) -> Packing:
-        """Return ``game.branch(games)``; what is known of the turn goes with it."""
+        """Return ``game.branch(games)``, for which the turn's results are stored too."""
         branched = game.branch(games)
         self.memo.follow(game, games, branched)
         return branched

@@ -1,1 +1,1 @@
-"""How the agents learn: PPO for both, behaviour cloning, symmetries, runs and checkpoints."""
+"""Learning of the agents: PPO, behaviour cloning, symmetries, the runner and checkpoints."""

@@ -12,11 +12,11 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
   it;
 - ``afterstate_critic``: weights of the critic of afterstates that the run owns, if agents see its
   values, and ``afterstate_optimizer``;
-- ``schedule_iteration``, ``iter``, ``items``, ``seconds``, ``evaluations``: how far the run was and
-  what it had reached;
+- ``schedule_iteration``, ``iter``, ``items``, ``seconds``, ``evaluations``: the run's progress and
+  its evaluations;
 - ``state``: in a run's latest checkpoint only, what resuming needs.
 
-Files of format 1 are read too (:mod:`marl_pack.agents.learning.migration`).
+Files of format 1 are migrated (:mod:`marl_pack.agents.learning.migration`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LATEST, BEST = "latest.pt", "best.pt"
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Write a checkpoint, so that the file is whole or the one before."""
+    """Write a checkpoint; if that fails, the file that was there stays."""
     write_atomically(path, lambda file: torch.save(dict(checkpoint), file))
 
 
@@ -52,7 +52,7 @@ def resolve(source: str | Path) -> Path:
         for name in (BEST, LATEST):
             if (path / name).is_file():
                 return path / name
-        raise FileNotFoundError(f"{path}: holds neither {BEST} nor {LATEST}; is it a run's folder?")
+        raise FileNotFoundError(f"{path}: needs {BEST} or {LATEST}, as a run's folder has")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     return path
@@ -66,7 +66,7 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
         ValueError: if the file is truncated, of another program or of a newer format.
     """
     path = resolve(source)
-    path.open("rb").close()  # where it may not be read, that is what to say
+    path.open("rb").close()  # raises the system's error if it may not be read
     if not zipfile.is_zipfile(path):
         raise ValueError(
             f"{path}: not a checkpoint, or cut short ({path.stat().st_size:,} bytes); "
@@ -98,7 +98,7 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
 
 
 def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return the record of one agent by which it plays elsewhere, as a frozen agent's is kept.
+    """Return what one agent needs to play in another run: its network, or a heuristic's name.
 
     Args:
         checkpoint: as :func:`read` returns it.

@@ -12,7 +12,7 @@ from marl_pack.agents.networks.kinds import AgentKind
 from marl_pack.agents.policy import draw
 from marl_pack.game.packing import Packing
 
-RANDOM_SHARE = 0.1  # of a teacher's choices are random, so that the learner stays unsure enough
+RANDOM_SHARE = 0.1  # of a teacher's choices are replaced, so that the learner keeps exploring
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Teacher:
 
     Args:
         kind: of the teacher and of the learner.
-        agent: the teacher: the games and what was chosen before → actions int64 [G].
-        iterations: for how many the learner clones it.
+        agent: the teacher: the games and the choices before → actions int64 [G].
+        iterations: how long the learner clones it.
     """
 
     kind: AgentKind

@@ -1,7 +1,7 @@
-"""Reading checkpoints of format 1 as those of format 2.
+"""Migrate checkpoints of format 1 to format 2.
 
 Format 1 had other names for planes, policies and settings, and kept the critic of afterstates once
-in each actor's weights. Its state of a run in play cannot be gone on with.
+in each actor's weights. The games in play that it stored cannot be resumed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ CRITIC = "afterstates."
 """Prefix of the critic's weights among an actor's."""
 
 UNRESUMABLE = (
-    "it was written by an earlier version, whose game in play this one cannot go on with; begin a "
-    "new run with --init and the settings of the old one"
+    "an earlier version wrote it, and its games in play cannot be continued; begin a new run with "
+    "--init and the settings of the old one"
 )
 
 
@@ -44,7 +44,7 @@ def from_format_1(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's settings by today's names."""
+    """Return a run's settings with today's names."""
     settings = dict(config)
     for name in ("orientation", "placement"):
         if name not in settings:
@@ -85,9 +85,9 @@ def _agent(record: Mapping[str, Any], learns: bool) -> dict[str, Any]:
         if not learns:
             agent["afterstate_critic"] = critic
         if "optimizer_state_dict" in agent:
-            first = [k for k in weights if not k.startswith(CRITIC)]
+            actor = agent["actor_state_dict"]
             agent["optimizer_state_dict"] = _optimizer(
-                agent["optimizer_state_dict"], len(first), len(critic)
+                agent["optimizer_state_dict"], len(actor), len(critic)
             )
     return agent
 

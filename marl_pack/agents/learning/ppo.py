@@ -1,9 +1,10 @@
 """PPO for agents that take turns: one stock rsl_rl ``PPO`` each, driven as if they were one.
 
-Within a step the orientation agent acts on what it observes, then the placement agent on what that
-choice shows it. Both store the same reward and the same end of episode (Eq. 3 – 5), each computes
-its advantages over its own turns. A frozen agent plays without learning. An agent that clones a
-teacher plays as the teacher does and learns to: all its choices have the same advantage.
+Within a step the orientation agent acts first. The placement agent then observes the item in the
+chosen orientation and acts. Both store the same reward and the same end of episode (Eq. 3 – 5), and
+each computes its advantages over its own turns. A frozen agent plays without learning. An agent
+that clones a teacher plays as the teacher does; all its choices have the same advantage, so that
+PPO makes them more probable.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ class Seat:
     Args:
         kind: of the agent.
         ppo: of a learner; None where ``frozen`` plays.
-        frozen: the games and what was chosen before → actions int64 [G].
+        frozen: plays in place of a learner: the games and the choices before → actions int64 [G].
         planes: extra planes that a learner observes.
         schedule: a learner's settings for :meth:`anneal`, and ``symmetry``.
-        teacher: whose choices a learner clones at first.
+        teacher: a learner clones its choices at first.
     """
 
     kind: AgentKind
@@ -53,23 +54,23 @@ class Seat:
     teacher: Teacher | None = None
 
     def teacher_at(self, iteration: int) -> Teacher | None:
-        """Return the teacher that the learner clones in an iteration, if it does."""
+        """Return the teacher that the learner clones in an iteration, None if there is none."""
         teacher = self.teacher
         return teacher if teacher and iteration < teacher.iterations else None
 
     def act(self, observation: TensorDict, game: Packing, before: Choice, iteration: int) -> Tensor:
-        """Return the actions int64 [G]; a learner's are recorded as its own."""
+        """Return the actions int64 [G], and record a learner's in its storage."""
         if self.ppo is None:
             return self._play_frozen(game, before)
         action = self.ppo.act(observation)
         teacher = self.teacher_at(iteration)
         if teacher is None:
             return action.squeeze(1).long()
-        chosen = teacher(game, *before)
-        taken = chosen.unsqueeze(1).to(action.dtype)
-        self.ppo.transition.actions = taken
-        self.ppo.transition.actions_log_prob = self.ppo.actor.get_output_log_prob(taken).detach()
-        return chosen
+        actions = teacher(game, *before)
+        recorded = actions.unsqueeze(1).to(action.dtype)
+        self.ppo.transition.actions = recorded
+        self.ppo.transition.actions_log_prob = self.ppo.actor.get_output_log_prob(recorded).detach()
+        return actions
 
     def draw(
         self, observation: TensorDict, game: Packing, before: Choice, iteration: int
@@ -99,20 +100,20 @@ class Seat:
 
 
 class PackingPPO:
-    """What rsl_rl's ``OnPolicyRunner`` takes for a PPO; the run's owner of the afterstate critic.
+    """The algorithm of rsl_rl's ``OnPolicyRunner``: all learners, and the critic of afterstates.
 
     Args:
         seats: the agents, in the order of their turns.
         env: the games.
         lookahead: what placements leave, and its value; shared by all learners.
         iterations: how many there will be, for the schedules.
-        afterstates: which teaches the critic of afterstates, if agents see its values.
+        afterstates: fits the critic of afterstates, if agents see its values.
 
     Raises:
         ValueError: if no agent learns.
     """
 
-    rnd = None  # no exploration bonus; the runner asks
+    rnd = None  # no exploration bonus; the runner reads it
 
     def __init__(
         self,
@@ -138,7 +139,7 @@ class PackingPPO:
     # --- the rollout ------------------------------------------------------------------------------
 
     def _observation(self, seat: Seat, before: Choice, first: TensorDict) -> TensorDict:
-        """Return what an agent observes at its turn: in the first turn ``first``."""
+        """Return what an agent observes at its turn; ``first`` in the first turn."""
         if not before or seat.ppo is None:
             return first
         game = self.env.game
@@ -165,15 +166,15 @@ class PackingPPO:
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
     ) -> None:
-        """Record the reward that the agents share."""
+        """Record the reward of a step, which all agents share."""
         for ppo in self.learners.values():
             ppo.process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute the advantages of the rollout that ends at ``obs``.
 
-        The value of what follows is each agent's at its next turn; the choices before that turn are
-        drawn.
+        Each agent's return is completed by its own value at its next turn. The choices of the
+        agents before it are drawn, and not recorded.
         """
         self._last = obs
         game = self.env.game
@@ -219,12 +220,12 @@ class PackingPPO:
             losses[f"{name}/learning_rate"] = ppo.learning_rate
         self.iteration += 1
         if self.afterstates is not None and self._last is not None:
-            with torch.inference_mode():  # what was observed before the critic learned
+            with torch.inference_mode():  # its values are those of the critic before it learned
                 self._last.update_(self.env.get_observations())
         return losses
 
     def _learn_afterstates(self, learner: AfterstateLearner) -> float:
-        """Teach the critic of afterstates by the returns of the first learner's placements."""
+        """Fit the critic of afterstates to the returns of the first learner."""
         ppo = next(iter(self.learners.values()))
         processes = ppo.gpu_world_size if ppo.is_multi_gpu else 1
         storage = ppo.storage
@@ -242,11 +243,11 @@ class PackingPPO:
             new = ppo.actor.output_distribution_params
             return float(ppo.actor.get_kl_divergence(old, new).mean())
 
-    # --- what else the runner asks ----------------------------------------------------------------
+    # --- what else the runner needs ---------------------------------------------------------------
 
     @property
     def learning_rate(self) -> float:
-        """The first learner's; each one's own is among the losses."""
+        """Learning rate of the first learner; each learner's own is among the losses."""
         return float(next(iter(self.learners.values())).learning_rate)
 
     @property
@@ -255,7 +256,7 @@ class PackingPPO:
         return torch.cat([ppo.actor.output_std for ppo in self.learners.values()])
 
     def get_policy(self) -> PackingPPO:
-        """Return itself: there is more than one actor."""
+        """Return the algorithm itself, as there is more than one actor."""
         return self
 
     def train_mode(self) -> None:
@@ -269,7 +270,7 @@ class PackingPPO:
             ppo.eval_mode()
 
     def broadcast_parameters(self) -> None:
-        """Give all processes the first one's weights."""
+        """Give all processes the weights of the first one."""
         for ppo in self.learners.values():
             ppo.broadcast_parameters()
         if self.afterstates is not None:
@@ -310,7 +311,7 @@ class PackingPPO:
     def construct_algorithm(
         obs: TensorDict, env: PackingVecEnv, cfg: dict[str, Any], device: str
     ) -> PackingPPO:
-        """Build it from the runner's configuration.
+        """Build the algorithm from the runner's configuration.
 
         Args:
             obs: an observation.
@@ -362,7 +363,7 @@ def _stock_ppo(
     cfg: dict[str, Any],
     device: str,
 ) -> PPO:
-    """Build rsl_rl's own PPO with our actor and critic."""
+    """Build rsl_rl's own PPO with the actor and critic of an agent."""
     network = dict(settings["network"])
     model = {"agent": name, "network": network}
     agent_cfg = {

@@ -1,7 +1,7 @@
-"""rsl_rl's ``OnPolicyRunner`` with checkpoints that resume exactly, and evaluation as it goes.
+"""The runner of a training run: rsl_rl's ``OnPolicyRunner`` with exact resuming and evaluation.
 
-The training loop, the optimisation and the scalars are rsl_rl's own; what is added happens once an
-iteration, after rsl_rl has logged it.
+The training loop, the optimisation and the scalars are rsl_rl's own. Evaluations and checkpoints
+are added once an iteration, after rsl_rl has logged it.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ from marl_pack.agents.policy import Placement, Policy
 from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
-COMPARABLE = ("seed", "episodes")  # evaluations that agree in these are of the same sequences
+COMPARABLE = ("seed", "episodes")  # evaluations that agree in these play the same sequences
 LOGGER_STATE = ("tot_timesteps", "tot_time", "cur_reward_sum", "cur_episode_length")
 LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
 
 
 class RunInterruptedError(Exception):
-    """The run was asked to stop, and has, at the end of an iteration, with a checkpoint."""
+    """The run was stopped on request, after an iteration and with a checkpoint written."""
 
 
 class TrainingDivergedError(Exception):
-    """Losses are no numbers any more; the last checkpoint is as it was."""
+    """A loss is not finite any more; the last checkpoint is as it was."""
 
 
 class Runner(OnPolicyRunner):
     """Trains the agents of :class:`marl_pack.agents.learning.ppo.PackingPPO`.
 
     Args:
-        env: the bins.
+        env: the games.
         train_cfg: as rsl_rl's runner takes it, with ``agents`` and ``algorithm`` as
             :meth:`PackingPPO.construct_algorithm` says, and ``latest_every``, ``evaluate_every``:
             iterations between checkpoints and between evaluations (0: none).
-        log_dir: the run's folder; None keeps no logs and no checkpoints.
+        log_dir: the run's folder; None: no logs and no checkpoints.
         device: of everything.
-        config: the run's settings, kept in the checkpoints.
-        evaluate: gives a dict with ``utilization`` of the policy in a checkpoint.
-        show: is told of each iteration.
-        evaluated: is told of each evaluation, with the history up to it.
+        config: the run's settings, stored in the checkpoints.
+        evaluate: a checkpoint → figures of its policy, ``utilization`` among them.
+        show: is called with the figures of each iteration.
+        evaluated: is called after each evaluation, with the history up to it.
     """
 
     alg: PackingPPO
@@ -93,7 +93,7 @@ class Runner(OnPolicyRunner):
         }
 
     def train(self, iterations: int) -> None:
-        """Learn until the run has done ``iterations`` in all.
+        """Train until the run has done ``iterations`` in all.
 
         Raises:
             RunInterruptedError: if :attr:`stop_requested` was set; a checkpoint has been written.
@@ -101,20 +101,20 @@ class Runner(OnPolicyRunner):
         self.last_iteration = iterations - 1
         remaining = iterations - self.current_learning_iteration
         self.current_learning_iteration -= 1  # the one last done
-        self._write_latest()  # from now on the run can be gone on with, with its settings
+        self._write_latest()  # from now on the run can be resumed
         self.current_learning_iteration += 1
         if remaining > 0:
             self.learn(remaining)
             self.current_learning_iteration += 1  # rsl_rl would repeat the last one
 
     def _after_iteration(self, progress: Progress) -> None:
-        """Evaluate, checkpoint and stop where it is time to."""
+        """Show the iteration; evaluate, write a checkpoint and stop where that is due."""
         self.current_learning_iteration = it = progress.iteration - 1
         self.show(progress)
-        wrong = [key for key, value in progress.losses.items() if not math.isfinite(value)]
-        if wrong:
+        not_finite = [key for key, value in progress.losses.items() if not math.isfinite(value)]
+        if not_finite:
             raise TrainingDivergedError(
-                f"training diverged in iteration {progress.iteration}: {', '.join(wrong)} not "
+                f"training diverged in iteration {progress.iteration}: {', '.join(not_finite)} not "
                 "finite; the last checkpoint is as it was; try a smaller learning rate"
             )
         final = it == self.last_iteration
@@ -139,20 +139,22 @@ class Runner(OnPolicyRunner):
             )
 
     def _evaluate(self, progress: Progress) -> None:
-        """Add a row to the history; keep the checkpoint if it is the best so far."""
+        """Add a row to the history; store the checkpoint as best if it is."""
         if self.gpu_global_rank != 0:
             return
         start = time.perf_counter()
-        found = self.evaluate(self.checkpoint())  # type: ignore[misc]  # the caller has looked
+        figures = self.evaluate(self.checkpoint())  # type: ignore[misc]  # the caller has checked
         row = {
             "iteration": progress.iteration,
             "items": progress.items,
             "seconds": progress.seconds,
-            **found,
+            **figures,
             "evaluation_seconds": time.perf_counter() - start,
         }
-        same = [r for r in self.evaluations if all(r.get(k) == row.get(k) for k in COMPARABLE)]
-        best = max((r["utilization"] for r in same), default=float("-inf"))
+        comparable = [
+            r for r in self.evaluations if all(r.get(k) == row.get(k) for k in COMPARABLE)
+        ]
+        best = max((r["utilization"] for r in comparable), default=float("-inf"))
         self.evaluations.append(row)
         if self.logger.writer is not None:
             self.logger.writer.add_scalar(
@@ -160,19 +162,19 @@ class Runner(OnPolicyRunner):
             )
         self.evaluated(self.evaluations)
         if row["utilization"] > best:
-            checkpoints.write(self.folder / checkpoints.BEST, self.checkpoint())  # type: ignore[operator]  # likewise
+            checkpoints.write(self.folder / checkpoints.BEST, self.checkpoint())  # type: ignore[operator]  # as above
 
     # --- checkpoints ------------------------------------------------------------------------------
 
     def checkpoint(self) -> dict[str, Any]:
-        """Settings, networks and progress, as :mod:`marl_pack.agents.learning.checkpoint` says."""
+        """Return what a checkpoint holds: settings, networks and progress."""
         algorithm = self.alg.save()
         learned = {
             name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
             for name, state in algorithm.pop("learners").items()
         }
         for seat in self.alg.seats:
-            if seat.teacher_at(self.alg.iteration) is not None:  # to go on without the old file
+            if seat.teacher_at(self.alg.iteration) is not None:  # resuming needs no other file
                 name = seat.kind.name
                 learned[name]["teacher"] = self.cfg["agents"][name]["teacher"]
         return {
@@ -188,17 +190,17 @@ class Runner(OnPolicyRunner):
         }
 
     def state(self) -> dict[str, Any]:
-        """What else this process needs to go on as if it had never stopped."""
+        """Return what else this process needs to resume exactly where it stopped."""
         random: dict[str, Tensor] = {"cpu": torch.get_rng_state()}
         if torch.device(self.device).type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
         logger = {name: getattr(self.logger, name) for name in LOGGER_STATE}
         logger |= {name: list(getattr(self.logger, name)) for name in LOGGER_BUFFERS}
-        kept = {"game": self.env.game.state_dict(), "random": random, "logger": logger}
+        state = {"game": self.env.game.state_dict(), "random": random, "logger": logger}
         if self.alg.afterstates is not None:
-            kept["afterstates"] = self.alg.afterstates.state_dict()
+            state["afterstates"] = self.alg.afterstates.state_dict()
         on_cpu: dict[str, Any] = tree_map(
-            lambda value: value.cpu() if torch.is_tensor(value) else value, kept
+            lambda value: value.cpu() if torch.is_tensor(value) else value, state
         )
         return on_cpu
 
@@ -214,7 +216,7 @@ class Runner(OnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict[str, Any] | None:
-        """Load networks and optimisers from a checkpoint, to learn on from its next iteration."""
+        """Load networks and optimisers from a checkpoint, to train from its next iteration on."""
         checkpoint = checkpoints.read(path, map_location or self.device)
         if self.alg.load(checkpoint | {"learners": checkpoint["agents"]}, load_cfg, strict):
             self.current_learning_iteration = checkpoint["iter"] + 1
@@ -222,14 +224,14 @@ class Runner(OnPolicyRunner):
         return infos
 
     def begin_with(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take the learners' weights from another run; nothing else of it.
+        """Load the learners' weights from another run, and nothing else of it.
 
         Args:
             checkpoint: as :func:`marl_pack.agents.learning.checkpoint.read` returns it.
 
         Raises:
-            ValueError: if an agent that learns here did not there, or has another network (it may
-                see more planes here: those weigh 0 at first).
+            ValueError: if an agent that learns here did not learn there, or its network differs. It
+                may see more planes here, with weights of 0 at first.
         """
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
@@ -240,8 +242,8 @@ class Runner(OnPolicyRunner):
                 for network in (self.cfg["agents"][name]["network"], agent["network"])
             )
             more = set(old.planes) <= set(new.planes)
-            wanted = asdict(new) | ({"planes": old.planes} if more else {})
-            if other := {key: v for key, v in asdict(old).items() if wanted[key] != v}:
+            needed = asdict(new) | ({"planes": old.planes} if more else {})
+            if other := {key: v for key, v in asdict(old).items() if needed[key] != v}:
                 raise ValueError(
                     f"init: the checkpoint's {name} agent has another network: {other}; begin with "
                     "the same, or one that sees more planes (--config with the settings of its run)"
@@ -250,11 +252,11 @@ class Runner(OnPolicyRunner):
                 weights = agent[f"{part}_state_dict"]
                 orientations = AGENT_KINDS[name].orientations
                 getattr(ppo, part).load_state_dict(widen(weights, old, new, orientations))
-        if "afterstate_critic" in checkpoint:  # else it begins fresh
+        if "afterstate_critic" in checkpoint:  # else it has new weights
             self.alg.load_afterstate_critic(checkpoint["afterstate_critic"])
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on exactly from the checkpoint of a run with the same settings.
+        """Resume exactly from the checkpoint of a run with the same settings.
 
         Args:
             checkpoint: the run's latest, as :func:`marl_pack.agents.learning.checkpoint.read`
@@ -266,11 +268,11 @@ class Runner(OnPolicyRunner):
         states = checkpoint.get("state")
         if states is None:
             raise ValueError("this checkpoint holds no state of the game; resume from latest.pt")
-        if isinstance(states, str):  # it says why it cannot be resumed
+        if isinstance(states, str):  # the reason why it cannot be resumed
             raise ValueError(f"this run cannot be resumed: {states}")
         if len(states) != self.gpu_world_size:
             raise ValueError(
-                f"the run had {len(states)} processes, this one has {self.gpu_world_size}"
+                f"{self.gpu_world_size} processes: the run needs {len(states)}, as it had"
             )
         try:
             self.alg.load(dict(checkpoint) | {"learners": checkpoint["agents"]}, None, True)
@@ -278,7 +280,7 @@ class Runner(OnPolicyRunner):
                 own_critic = states[self.gpu_global_rank]["afterstates"]
                 self.alg.afterstates.load_state_dict(own_critic)
         except (RuntimeError, KeyError, TypeError) as error:
-            raise ValueError(f"the checkpoint does not fit its own settings: {error}") from None
+            raise ValueError(f"the checkpoint does not match its own settings: {error}") from None
         self.current_learning_iteration = checkpoint["iter"] + 1
         self.evaluations = list(checkpoint["evaluations"])
         own = states[self.gpu_global_rank]
@@ -293,7 +295,7 @@ class Runner(OnPolicyRunner):
             torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
-        """Return the policy as it is now, each agent taking its most probable action."""
+        """Return the current policy, in which each agent takes its most probable action."""
         agents = [
             LearnedAgent(seat.kind.name, seat.ppo.actor, self.alg.lookahead)
             if seat.ppo is not None
@@ -312,7 +314,7 @@ class Runner(OnPolicyRunner):
         return play
 
     def export_policy_to_onnx(self, path: str, *args: Any, **named: Any) -> None:
-        """Refused: there is more than one policy, and masks, which rsl_rl's exporter does not know.
+        """Refuse to export: rsl_rl's exporter knows neither several policies nor masks.
 
         Raises:
             NotImplementedError: always; ``python -m marl_pack.export`` writes the agents.
@@ -324,7 +326,7 @@ class Runner(OnPolicyRunner):
     # --- several processes ------------------------------------------------------------------------
 
     def _configure_multi_gpu(self) -> None:
-        """As rsl_rl does for GPUs; processes on the CPU speak through gloo."""
+        """Set up the processes as rsl_rl does; those on the CPU communicate through gloo."""
         world = int(os.environ.get("WORLD_SIZE", "1"))
         if world == 1 or torch.device(self.device).type != "cpu":
             super()._configure_multi_gpu()
@@ -338,7 +340,7 @@ class Runner(OnPolicyRunner):
         torch.distributed.init_process_group("gloo", rank=rank, world_size=world)
 
     def _any_process(self, flag: bool) -> bool:
-        """Whether any process says so."""
+        """Return whether the flag is set in any process."""
         if not self.is_distributed:
             return flag
         votes = torch.tensor(float(flag), device=self.device)
@@ -346,7 +348,7 @@ class Runner(OnPolicyRunner):
         return bool(votes)
 
     def _gather(self, state: dict[str, Any]) -> list[dict[str, Any]] | None:
-        """The states of all processes, in the first one."""
+        """Return the states of all processes; only the first one receives them."""
         if not self.is_distributed:
             return [state]
         states: list[Any] = [None] * self.gpu_world_size

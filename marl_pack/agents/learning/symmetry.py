@@ -1,4 +1,4 @@
-"""Augmentation of what PPO learns from by the symmetries of the bin."""
+"""Augment the samples of PPO by the symmetries of the bin."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from marl_pack.agents.networks.symmetry import count, transform
 
 
 def mirror_rollout(ppo: PPO, agent: str) -> None:
-    """Show a rollout to its update through a symmetry of the bin drawn for each sample.
+    """Replace each sample of a rollout by its image under a random symmetry of the bin.
 
     Rewards and returns are as they were. The old log-probabilities, distributions and values become
-    those of what is now observed, so that the update begins from ratios of 1.
+    those of the mirrored observations, so that the update begins from ratios of 1.
 
     Args:
-        ppo: whose storage is full.
+        ppo: a learner's, with a full storage.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
     """
     storage = ppo.storage

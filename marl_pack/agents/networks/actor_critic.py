@@ -1,4 +1,4 @@
-"""Actors and critics as rsl_rl's PPO drives them: any agent's trunk, head and distribution."""
+"""The actor and the critic of an agent, as models of rsl_rl's PPO."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Actor(MLPModel):
     """An agent's policy: trunk (``cnns``), head (``mlp``) and masked distribution.
 
     Args:
-        obs: an observation of G games; any Mapping of tensors does.
+        obs: an observation of G games, any mapping of tensors.
         obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         network: fields of :class:`marl_pack.agents.networks.trunk.Network`.
@@ -56,7 +56,7 @@ class Actor(MLPModel):
 
 
 class Critic(MLPModel):
-    """An agent's value of the state that it observes at its turn, [G, 1].
+    """An agent's critic: the value [G, 1] of the state that it observes at its turn.
 
     Args:
         obs, obs_groups, obs_set, output_dim, agent, network: as for :class:`Actor`.
@@ -94,14 +94,14 @@ class Critic(MLPModel):
 
 
 def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | str) -> Actor:
-    """Build an actor with fresh weights, to load a checkpoint into."""
+    """Build an actor with new weights, to load a checkpoint into."""
     return Actor({}, {"actor": []}, "actor", 1, agent=agent, network=network).to(device)
 
 
 def make_critic(
     agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor | None = None
 ) -> Critic:
-    """Build a critic with fresh weights; one that shares its actor's trunk needs that actor."""
+    """Build a critic with new weights; one that shares its actor's trunk needs that actor."""
     trunk = actor.cnns if actor is not None and Network(**network).share_trunk else None
     critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
     return critic.to(device)

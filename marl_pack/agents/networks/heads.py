@@ -9,7 +9,7 @@ from marl_pack.agents.networks.trunk import Features, Network, count_features
 
 
 class Pool(nn.Module):
-    """:attr:`marl_pack.agents.networks.trunk.Features.pooled` as a layer."""
+    """A layer that returns the pooled features (:attr:`.trunk.Features.pooled`)."""
 
     def forward(self, features: Features) -> Tensor:
         """Return mean and maximum over the cells, [B, 2C]."""
@@ -17,7 +17,7 @@ class Pool(nn.Module):
 
 
 def pooled_head(network: Network, orientations: int, outputs: int, gain: float) -> nn.Sequential:
-    """Build a head that makes ``outputs`` numbers of the pooled features, by one hidden layer."""
+    """Build a head of one hidden layer, from the pooled features to ``outputs`` numbers."""
     return nn.Sequential(
         Pool(),
         initialized(nn.Linear(2 * count_features(network, orientations), network.hidden)),

@@ -1,4 +1,4 @@
-"""The kinds of agents: one record each in :data:`AGENT_KINDS`, and what each kind observes."""
+"""The kinds of agents: one record each in :data:`AGENT_KINDS`, and the observation of each."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from marl_pack.game.moves import Floor
 from marl_pack.game.packing import Packing
 
 Choice = tuple[Tensor, ...]
-"""What was chosen so far in a turn of the game: (), (orientation,) or (orientation, cell), int64
+"""The choices so far in a turn of the game: (), (orientation,) or (orientation, cell), int64
 [G] each."""
 
 
 @dataclass(frozen=True)
 class AgentKind:
-    """How one kind of agent observes and acts.
+    """The record of how one kind of agent observes and acts.
 
     Args:
         name: its name in settings, checkpoints and scalars.
@@ -31,7 +31,7 @@ class AgentKind:
             they are orientations.
         mask: its legal actions in a turn, bool [G, K].
         head: builds the network's head: features → logits [G, K].
-        extend: adds its actions int64 [G] to what was chosen before.
+        extend: adds its actions int64 [G] to the choices before.
     """
 
     name: str
@@ -85,7 +85,7 @@ def observe(
     lookahead: Lookahead,
     orientation: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Return what an agent observes of G games; training, play and export all use this.
+    """Return what an agent observes of G games, in training, play and export alike.
 
     Args:
         kind: name in :data:`AGENT_KINDS`.

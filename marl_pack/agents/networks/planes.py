@@ -1,8 +1,8 @@
 """The input planes of the networks: one record each in :data:`PLANES`.
 
-A plane says which tensors an observation gets for it and which input channels they become. All else
-derives from these records: the settings and their help, the symmetries of the bin, the exported
-files, and networks that grow more planes.
+A record says which tensors an observation holds for a plane, and which input channels they become.
+Everything else derives from these records: the settings and their help, the symmetries of the bin,
+the exported files, and networks that get more planes.
 
 The shape of a tensor in an observation says what it describes. In [G, W, D] each cell describes a
 column of the bin; in [G, A, W, D] each cell describes a placement with its low corner there, in one
@@ -30,12 +30,12 @@ Observation = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Sight:
-    """A turn of G games as one agent observes it.
+    """One agent's view of a turn of G games.
 
     Args:
         game: the games.
         lookahead: what placements leave, and its value.
-        planes: names of the planes that will be made.
+        planes: names of the planes to make.
         orientation: int64 [G], once the orientations are chosen; None before.
     """
 
@@ -52,19 +52,19 @@ class Sight:
         return self.game.orient(self.orientation).sides
 
     def judged(self, values: Tensor) -> Tensor:
-        """Return the values [G, 6, …] of the A orientations that the agent judges, [G, A, …]."""
+        """Select the values [G, 6, …] of the A orientations that the agent judges, [G, A, …]."""
         if self.orientation is None:
             return values
         return Moves.gather(values, self.orientation)[:, None]
 
     @cached_property
     def mask(self) -> Tensor:
-        """Where the item may be placed in the orientations that the agent judges, [G, A, W, D]."""
+        """The cells where the item may be placed in the judged orientations, bool [G, A, W, D]."""
         return self.judged(self.game.mask)
 
     @cached_property
     def windows(self) -> tuple[Tensor, Tensor]:
-        """Resting height int16 and wasted cells int32 [G, A, W, D] (no entries if not needed)."""
+        """Resting heights int16 and wasted cells int32 [G, A, W, D] (no entries if not needed)."""
         if self.orientation is None:
             sides = self.game.orient_item(self.game.items).sides
         else:
@@ -81,9 +81,8 @@ class Plane:
 
     Args:
         name: its name in settings.
-        meaning: what it shows.
-        observe: a turn → tensors of the observation, by name; one of several planes may give a
-            tensor that another gives too.
+        meaning: its meaning in a few words.
+        observe: a turn → tensors of the observation, by name; planes may share a tensor.
         channels: number of input channels for A orientations.
         encode: the observation → input channels, float32 [G, …, W, D] each.
         needs_critic: whether a critic of afterstates has to be there.
@@ -169,15 +168,15 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "feasible_cells",
-            "in how many cells, on average, the next item may be placed afterwards: 1 for the most "
-            "that any placement leaves, 0 from a fifth less on; and how many that most is",
+            "the mean number of cells where the next item may be placed afterwards: 1 for the most "
+            "of all placements, 0 for a fifth less or fewer; and that most itself",
             _observe_feasible_cells,
             lambda orientations: orientations + 1,
             _encode_feasible_cells,
         ),
         Plane(
             "feasible_probability",
-            "how probable it is that the next item has a place afterwards",
+            "the probability that the next item has a feasible cell afterwards",
             lambda sight: {
                 "feasible_probability": sight.judged(
                     sight.lookahead.feasible_probability(sight.game)
@@ -188,9 +187,9 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "afterstate_value",
-            "the return that a critic of afterstates expects from each placement on: 1 for the "
-            "best, 0 from a twentieth of the bin less on, again from a two-hundredth less on; and "
-            "the best itself",
+            "the return that a critic of afterstates expects of each placement, on two scales: 1 "
+            "for the best, 0 for a twentieth of the bin less, or for a two-hundredth less; and the "
+            "best itself",
             _observe_afterstate_value,
             lambda orientations: 2 * orientations + 1,
             _encode_afterstate_value,
@@ -205,8 +204,7 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "filled",
-            "how much of the bin is filled; where items were cut from the bin, this says how much "
-            "is still to come",
+            "the filled share of the bin; if items are cut from the bin, the rest is to come",
             lambda sight: {"filled": utilization(sight.game.bins)[:, None].float()},
             lambda orientations: 1,
             lambda observation: [_everywhere(observation["filled"], _shape(observation))],

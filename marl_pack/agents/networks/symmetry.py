@@ -1,9 +1,9 @@
-"""The bin's symmetries: how observations and actions move, and agents asked in all of them.
+"""The symmetries of the bin: mirrored observations and actions, and averages over symmetries.
 
-Mirroring the bin along x or y and, where W = D, exchanging x and y change nothing in the game: a
-box placed in the mirrored bin stands as it did. What describes a placement lies at the low corner
-of its window, which moves with the item's sides; exchanging x and y also exchanges orientations o
-and o ^ 1. How a tensor of an observation moves follows from its shape
+Mirroring the bin along x or y and, if W = D, exchanging x and y change nothing in the game: a box
+in the mirrored bin is as stable as before. The entry of a placement is at the low corner of its
+window, so where it moves depends on the item's sides. Exchanging x and y also exchanges
+orientations o and o ^ 1. How a tensor of an observation moves follows from its shape
 (:mod:`marl_pack.agents.networks.planes`).
 """
 
@@ -30,9 +30,9 @@ def count(width: int, depth: int) -> int:
 def mean_probabilities(actor: Actor, observation: Observation, agent: str) -> Tensor:
     """Average the probability of each action over the bin's symmetries, float32 [G, K].
 
-    The actor judges the same decision as often as the bin has symmetries. Where items have their
-    centre of mass off centre, or o may be chosen but not o ^ 1, a mirrored state is only nearly one
-    of the game; what is legal stays what the game says.
+    The actor judges the same decision once for each symmetry of the bin. If items have their centre
+    of mass off centre, or o may be chosen but not o ^ 1, a mirrored state is only nearly one of the
+    game. The mask is the game's in every case.
 
     Args:
         actor: the agent's network.
@@ -43,18 +43,18 @@ def mean_probabilities(actor: Actor, observation: Observation, agent: str) -> Te
     shape = observation["heightmap"].shape[1:]
     actions = torch.arange(mask.shape[1], device=mask.device).expand(len(mask), -1)
     total = torch.zeros(mask.shape, device=mask.device)
-    kinds = count(*shape)
-    for kind in range(kinds):
-        symmetry = torch.full((len(mask),), kind, device=mask.device)
+    symmetries = count(*shape)
+    for number in range(symmetries):
+        symmetry = torch.full((len(mask),), number, device=mask.device)
         log_probs = actor.log_probs(mirror_observation(observation, agent, symmetry))
         total += log_probs.exp().gather(1, mirror_actions(actions, item, shape, agent, symmetry))
-    return total / kinds
+    return total / symmetries
 
 
 def transform(
     observation: Observation, actions: Tensor, agent: str, symmetry: Tensor
 ) -> tuple[Any, Tensor]:
-    """Return observations and actions of B games after each one's symmetry.
+    """Apply a symmetry of the bin to the observation and the actions of each of B games.
 
     Args:
         observation: of the agent.
@@ -63,7 +63,7 @@ def transform(
         symmetry: int64 [B], bits: 1 mirrors x, 2 mirrors y, then 4 exchanges x and y (W = D).
 
     Returns:
-        The same tensors, and the actions that place the items in the same, now mirrored, places.
+        The mirrored observation, and the actions that place the items in the mirrored places.
     """
     shape = observation["heightmap"].shape[1:]
     mirrored = mirror_actions(actions.long(), observation["item"], shape, agent, symmetry)
@@ -77,7 +77,7 @@ def _exchanged(swap: Tensor, a: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mirrored(low: Tensor, side: Tensor | int, length: int, flip: Tensor) -> Tensor:
-    """Return where low corners lie in a mirrored bin; positions that never fit stay in range."""
+    """Return the low corners in a mirrored bin; positions that are never legal stay in range."""
     return torch.where(flip, (length - side - low) % length, low)
 
 
@@ -142,14 +142,14 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     if isinstance(observation, dict):
         return mirrored
     container: Any = type(observation)  # a TensorDict
-    return container(mirrored, observation.batch_size)  # type: ignore[attr-defined]  # likewise
+    return container(mirrored, observation.batch_size)  # type: ignore[attr-defined]  # a TensorDict
 
 
 def mirror_actions(
     actions: Tensor, item: Tensor, shape: Sequence[int], agent: str, symmetry: Tensor
 ) -> Tensor:
     """Return the actions of :func:`transform`, any number for each game, int64 [B, K]."""
-    # Actions are carried forwards: mirrors first, then the exchange.
+    # Actions move forwards: first the mirrors, then the exchange.
     kind = AGENT_KINDS[agent]
     flip_x, flip_y, swap = (bit[:, None] for bit in _bits(symmetry))
     if not kind.acts_on_cells:

@@ -20,7 +20,7 @@ from marl_pack.agents.networks.planes import PLANES, Observation, channel_names,
 
 @dataclass
 class Network:
-    """Shape of an agent's network.
+    """The shape of an agent's network.
 
     Args:
         channels: feature channels of the convolutional trunk.
@@ -30,7 +30,7 @@ class Network:
             reach 5 cells far in place of 3.
         shortcut: whether the heads see the input channels themselves beside the features.
         context: whether features pooled over the whole bin are added to every cell's.
-        planes: what is seen beside the paper's four channels: any of {planes}.
+        planes: input planes beside the paper's four channels: any of {planes}.
         hidden: units of the hidden layer in the heads that follow pooling.
         share_trunk: whether the critic sees the actor's features or has a trunk of its own.
     """
@@ -85,25 +85,25 @@ class Features:
 
     @property
     def whole(self) -> Tensor:
-        """Features and inputs, one after the other: [B, C + P, W, D]."""
+        """Features and inputs, in one tensor [B, C + P, W, D]."""
         return self.cells if self.inputs is None else torch.cat((self.cells, self.inputs), 1)
 
     @cached_property
     def pooled(self) -> Tensor:
-        """:func:`pool` of :attr:`whole`, computed once for actor and critic."""
+        """The pooled :attr:`whole` (:func:`pool`), computed once for actor and critic."""
         if self.inputs is None:
             return pool(self.cells)
-        # Apart, as nothing is learned of the inputs: a backward pass through them is costly.
+        # Pooled apart: the inputs need no gradient, and a backward pass through them is costly.
         parts = (pool(values).chunk(2, 1) for values in (self.cells, self.inputs))
         return torch.cat([part for both in zip(*parts, strict=True) for part in both], 1)
 
 
 class Trunk(nn.Module):
-    """Observation → :class:`Features`, as many as :func:`count_features` says.
+    """The convolutional layers of a network, from an observation to :class:`Features`.
 
     Args:
         orientations: A, how many orientations the agent judges.
-        network: its shape.
+        network: the shape of the network.
     """
 
     def __init__(self, orientations: int, network: Network) -> None:
@@ -139,7 +139,7 @@ class Trunk(nn.Module):
         return features
 
     def take(self, observation: Observation) -> Features:
-        """Return the features that :meth:`store` computed of this very object, else new ones."""
+        """Return the features that :meth:`store` computed of the same object, else new ones."""
         stored, self._stored = self._stored, None
         if stored is not None and stored[0] is observation:
             return stored[1]
@@ -150,7 +150,7 @@ class Trunk(nn.Module):
 def widen(
     weights: Mapping[str, Tensor], old: Network, new: Network, orientations: int
 ) -> dict[str, Tensor]:
-    """Return an actor's or critic's weights for a network that sees more planes: those weigh 0.
+    """Return an actor's or critic's weights for a network with more planes, whose weights are 0.
 
     Args:
         weights: a state_dict of the network ``old``.

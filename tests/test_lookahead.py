@@ -1,4 +1,4 @@
-"""Afterstates against the meaning of their fields, and bits against masks."""
+"""Afterstates equal the bins after each placement, and counts by bits equal those by masks."""
 
 import pickle
 from dataclasses import replace
@@ -39,10 +39,15 @@ def legal_cells(heights: np.ndarray, empty_map: np.ndarray, box: tuple[int, ...]
 
 
 @pytest.mark.parametrize("orientations", [(0, 1, 2, 3, 4, 5), (0, 1), (3,)])
-def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) -> None:
+def test_feasible_cells_and_probability_equal_the_reference(
+    orientations: tuple[int, ...],
+) -> None:
     game = in_play(3, 4, bin=(5, 4, 6), sides=(1, 3), orientations=orientations)
     lookahead = Lookahead()
-    room, fits = lookahead.feasible_cells(game), lookahead.feasible_probability(game)
+    mean_cells, probability = (
+        lookahead.feasible_cells(game),
+        lookahead.feasible_probability(game),
+    )
     chances = []
     for b, o in product(range(3), orientations):
         for x, y in game.mask[b, o].nonzero().tolist()[:2]:
@@ -51,22 +56,24 @@ def test_it_is_what_may_be_set_down_afterwards(orientations: tuple[int, ...]) ->
             maps = after.bins.heightmap[0].numpy(), after.bins.empty_map[0].numpy()
             boxes = list(product((1, 2, 3), repeat=3))
             cells = {box: legal_cells(*maps, box, 6) for box in boxes}
-            assert room[b, o, x, y].item() == pytest.approx(np.mean(list(cells.values())))
+            assert mean_cells[b, o, x, y].item() == pytest.approx(np.mean(list(cells.values())))
             axes = [ORIENTATIONS[a] for a in orientations]
             feasible = [any(cells[tuple(box[k] for k in row)] for row in axes) for box in boxes]
-            assert fits[b, o, x, y].item() == pytest.approx(np.mean(feasible))
+            assert probability[b, o, x, y].item() == pytest.approx(np.mean(feasible))
             chances.append(np.mean(feasible))
     assert min(chances) < 1  # some placements leave no place for some items
-    assert not room[~game.mask].any()
-    assert not fits[~game.mask].any()
+    assert not mean_cells[~game.mask].any()
+    assert not probability[~game.mask].any()
 
 
-def maps(left: Afterstates, game: Packing) -> list[torch.Tensor]:
-    """Everything that is known of each placement, on the bins' maps."""
-    known = [left.counts.flatten(1), left.surface, left.volume[:, None], left.waste[:, None],
-             left.filled[:, None], left.feasible_cells()[:, None],
-             left.feasible_probability({game.spec.orientations: 1.0})[:, None]]  # fmt: skip
-    return [torch.where(game.mask[..., None], values[left.index], 0) for values in known]
+def maps(afterstates: Afterstates, game: Packing) -> list[torch.Tensor]:
+    """Every value of each placement, on the bins' maps."""
+    rows = [
+        afterstates.volume, afterstates.waste, afterstates.filled, afterstates.feasible_cells(),
+        afterstates.feasible_probability({game.spec.orientations: 1.0}),
+    ]  # fmt: skip
+    tables = [afterstates.counts.flatten(1), afterstates.surface, *(row[:, None] for row in rows)]
+    return [torch.where(game.mask[..., None], table[afterstates.index], 0) for table in tables]
 
 
 def arguments_of(game: Packing) -> tuple[object, ...]:
@@ -86,73 +93,78 @@ def test_sets_of_bits_count_what_masks_count(settings: dict[str, object]) -> Non
 
 
 def test_the_probability_is_weighted_by_the_shares_of_the_orientation_sets() -> None:
-    left = Lookahead().afterstates(in_play(8, 6))
-    upright, all_six = (left.feasible_probability({o: 1.0}) for o in ((0, 1), tuple(range(6))))
-    mixed = left.feasible_probability({(0, 1): 0.25, tuple(range(6)): 0.75})
+    afterstates = Lookahead().afterstates(in_play(8, 6))
+    upright, all_six = (
+        afterstates.feasible_probability({o: 1.0}) for o in ((0, 1), tuple(range(6)))
+    )
+    mixed = afterstates.feasible_probability({(0, 1): 0.25, tuple(range(6)): 0.75})
     assert torch.allclose(mixed, 0.25 * upright + 0.75 * all_six)
     assert (upright < all_six).any()
 
 
-def test_what_is_said_of_a_placement_is_what_it_does() -> None:
+def test_afterstates_equal_the_bins_after_the_placement() -> None:
     game = in_play(8, 5)
-    left = Lookahead().afterstates(game)
+    afterstates = Lookahead().afterstates(game)
     policy = make_policy("random", seed=2)
     o, c = policy(game)
-    row = left.index[torch.arange(8), o, c // 10, c % 10]
+    row = afterstates.index[torch.arange(8), o, c // 10, c % 10]
     after = game.branch(torch.arange(8))
     after.place(o, c)
-    assert torch.equal(left.filled[row], after.bins.filled)
-    assert torch.equal(left.volume[row], after.bins.filled - game.bins.filled)
+    assert torch.equal(afterstates.filled[row], after.bins.filled)
+    assert torch.equal(afterstates.volume[row], after.bins.filled - game.bins.filled)
     empty_map = [b.empty_map.sum((1, 2), dtype=torch.int64) for b in (game.bins, after.bins)]
-    assert torch.equal(left.waste[row], empty_map[1] - empty_map[0])
+    assert torch.equal(afterstates.waste[row], empty_map[1] - empty_map[0])
     heights = after.bins.heightmap
     for level in range(11):
         share = (heights == level).float().mean((1, 2))
-        assert torch.allclose(left.surface[row, level], share)
+        assert torch.allclose(afterstates.surface[row, level], share)
     steps = torch.cat([heights.diff(dim=axis).abs().flatten(1) for axis in (1, 2)], 1)
     for step in range(6):
         share = (steps.clamp(max=5) == step).float().mean(1)
-        assert torch.allclose(left.surface[row, 11 + step], share)
+        assert torch.allclose(afterstates.surface[row, 11 + step], share)
 
 
-def test_lengths_longer_than_the_floor_have_no_place() -> None:
+def test_lengths_longer_than_the_floor_have_no_feasible_cell() -> None:
     game = in_play(4, 3, bin=(3, 12, 9), sides=(1, 3))
     sides = game.orient_item(game.items).sides
     for lengths in ((4, 5), (2, 13), (20,)):
-        known = game.bins, sides, game.mask, lengths
-        ours = afterstates_of(*known)
-        theirs = afterstates_of(replace(game.bins, backend=Backend.TENSOR), *known[1:])
+        arguments = game.bins, sides, game.mask, lengths
+        ours = afterstates_of(*arguments)
+        theirs = afterstates_of(replace(game.bins, backend=Backend.TENSOR), *arguments[1:])
         for counts in (ours, theirs):
             assert not counts.counts[:, -1].any()
         assert torch.equal(maps(ours, game)[0], maps(theirs, game)[0])
 
 
-def test_of_no_bins_there_is_nothing_left() -> None:
+def test_no_games_have_no_afterstates() -> None:
     game = in_play(4, 3).branch(torch.zeros(0, dtype=torch.int64))
     assert Lookahead().feasible_cells(game).shape == (0, 6, 10, 10)
 
 
-def test_a_branch_knows_what_is_left_already() -> None:
+def test_a_branch_reuses_the_afterstates_of_its_game() -> None:
     game, lookahead = in_play(6, 4), Lookahead()
-    left = lookahead.afterstates(game)
+    afterstates = lookahead.afterstates(game)
     which = torch.tensor([4, 1, 1])
     branch = lookahead.branch(game, which)
-    assert lookahead.afterstates(branch).counts is left.counts
+    assert lookahead.afterstates(branch).counts is afterstates.counts
     fresh = afterstates_of(*arguments_of(branch))
     own = lookahead.afterstates(branch)
-    for known, made in zip(maps(own, branch), maps(fresh, branch), strict=True):
-        assert torch.equal(known, made)
+    for stored, computed in zip(maps(own, branch), maps(fresh, branch), strict=True):
+        assert torch.equal(stored, computed)
 
 
-def test_no_placement_no_room() -> None:
+def test_without_a_legal_placement_there_is_no_afterstate() -> None:
     game = Packing(2, (4, 4, 4), [[3, 3, 3]] * 3, auto_reset=False)
     while game.alive.any():
         game.place(*make_policy("dblf")(game))
     assert Lookahead().afterstates(game).feasible_cells().shape == (0,)
     assert Lookahead().afterstates(game).feasible_probability({(0,): 1.0}).shape == (0,)
-    room, fits = Lookahead().feasible_cells(game), Lookahead().feasible_probability(game)
-    assert room.shape == fits.shape == (2, 6, 4, 4)
-    assert not room.any()
+    mean_cells, probability = (
+        Lookahead().feasible_cells(game),
+        Lookahead().feasible_probability(game),
+    )
+    assert mean_cells.shape == probability.shape == (2, 6, 4, 4)
+    assert not mean_cells.any()
 
 
 def test_a_lookahead_belongs_to_one_turn_of_one_game() -> None:
@@ -175,34 +187,34 @@ def test_a_lookahead_belongs_to_one_turn_of_one_game() -> None:
     assert torch.equal(lookahead.feasible_cells(game), second)
 
 
-def test_lengths_are_spread_evenly_and_few() -> None:
+def test_probe_lengths_are_few_and_evenly_spaced() -> None:
     assert probe_lengths(2, 5) == (2, 3, 4, 5)
     assert probe_lengths(1, 5) == (1, 2, 3, 4, 5)
     assert probe_lengths(6, 60) == (6, 20, 33, 46, 60)
     assert probe_lengths(3, 3) == (3,)
 
 
-def test_the_heuristic_leaves_more_than_others_do() -> None:
+def test_max_feasible_leaves_more_feasible_cells_than_others() -> None:
     assert sorted(ORIENTATIONS) == list(permutations(range(3)))
     game = in_play(32, 6)
     rows = torch.arange(32)
-    left = []
+    cells = []
     for name in ("max_feasible", "dblf", "random"):
         o, c = make_policy(name)(game)
-        left.append(Lookahead().feasible_cells(game).flatten(2)[rows, o, c])
-    assert (left[0] >= left[1]).all()
-    assert (left[0] >= left[2]).all()
-    assert left[0].mean() > left[1].mean() > left[2].mean()
+        cells.append(Lookahead().feasible_cells(game).flatten(2)[rows, o, c])
+    assert (cells[0] >= cells[1]).all()
+    assert (cells[0] >= cells[2]).all()
+    assert cells[0].mean() > cells[1].mean() > cells[2].mean()
     best = Lookahead().feasible_cells(game).flatten(1).amax(1)
-    assert torch.equal(left[0], best)
+    assert torch.equal(cells[0], best)
 
 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     game = in_play(12, 5)
     assert int(game.mask.sum()) > 3 * PER_THREAD  # so several share the work
-    given = []
+    results = []
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda t=threads: t)
-        given.append(maps(afterstates_of(*arguments_of(game)), game))
-    for alone, shared in zip(*given, strict=True):
+        results.append(maps(afterstates_of(*arguments_of(game)), game))
+    for alone, shared in zip(*results, strict=True):
         assert torch.equal(alone, shared)
