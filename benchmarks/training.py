@@ -68,8 +68,9 @@ class Split:
 
 def watched(runner: Runner, split: Split) -> None:
     """Count the time in each part of a runner's iterations."""
-    for name in ("step", "orient", "get_observations"):
+    for name in ("step", "get_observations"):
         split.watch(runner.env, name, "game")
+    split.watch(runner.alg, "_observation", "game")  # of the second turn
     for ppo in runner.alg.learners.values():
         for name in ("act", "process_env_step", "compute_returns", "update"):
             split.watch(ppo, name, "rsl_rl")

@@ -20,10 +20,10 @@ from scipy import stats
 from benchmarks.timing import show
 from marl_pack.agents.heuristics import POLICIES
 from marl_pack.agents.loading import Loader
-from marl_pack.bins import Size
 from marl_pack.evaluation.rollout import play
 from marl_pack.evaluation.statistics import interval
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import Size
 from marl_pack.items import Stream, choose_stream
 
 GROUPS = 8

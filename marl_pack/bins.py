@@ -18,34 +18,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from marl_pack.backend import Backend, default_backend
-from marl_pack.geometry import (
-    MAX_HEIGHT,
-    MAX_SIDE,
-    ORIENTATIONS,
-    Size,
-    check_size,
-    orientation_table,
-    oriented,
-)
+from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
 from marl_pack.geometry.tensor import footprint, place_boxes
-
-__all__ = [
-    "MAX_HEIGHT",
-    "MAX_SIDE",
-    "ORIENTATIONS",
-    "Bins",
-    "Size",
-    "check_device",
-    "check_size",
-    "clear",
-    "empty",
-    "footprint",
-    "orientation_table",
-    "oriented",
-    "place",
-    "utilization",
-]
 
 UNKNOWN = -1
 """Label of a box whose item or orientation is not known."""

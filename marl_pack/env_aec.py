@@ -22,7 +22,7 @@ item's own sides w, d, h; the placement agent sees them along x, y, z in the cho
 
 **Legal actions.** An agent's ``action_mask`` is 1 at its legal actions, and all 0 when it is not
 its turn. Orientation o is legal if some cell is; a cell ``x · D + y`` is the item's low corner.
-The six orientations are the rows of :data:`marl_pack.bins.ORIENTATIONS`.
+The six orientations are the rows of :data:`marl_pack.geometry.ORIENTATIONS`.
 
 **Reward.** After each placement both agents get ``alpha · v_item - beta · v_waste``, as shares of
 the bin's volume (Eq. 5-7); after each orientation both get 0.
@@ -56,9 +56,9 @@ from pettingzoo.utils.conversions import (
     turn_based_aec_to_parallel_wrapper,
 )
 
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.game.packing import MOST_SKIPPED, Packing
 from marl_pack.game.spec import GameSpec, document, with_options
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.plan import Plan
 

@@ -14,9 +14,10 @@ from rich.console import Console
 
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import Policy, in_turns
-from marl_pack.bins import Size, check_device
+from marl_pack.bins import check_device
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, add_arguments, given_options
+from marl_pack.geometry import Size
 from marl_pack.items import (
     DEFAULT_SIDES,
     GENERATED,

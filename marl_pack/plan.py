@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.bins import ORIENTATIONS, Bins
+from marl_pack.bins import Bins
 from marl_pack.files import write_atomically, write_json
+from marl_pack.geometry import ORIENTATIONS
 
 Array = NDArray[Any]
 
@@ -51,7 +52,7 @@ class Plan:
     bins: NDArray[np.int64]  # [n]    bin of each box
     positions: Array  # [n, 3]        low corner x, y, z in its bin
     sides: Array  # [n, 3]            along x, y, z, as placed
-    orientations: NDArray[np.int64]  # [n]   row of marl_pack.bins.ORIENTATIONS; -1: unknown
+    orientations: NDArray[np.int64]  # [n]   row of marl_pack.geometry.ORIENTATIONS; -1: unknown
     weights: NDArray[np.float64]  # [n]      > 0, in any unit (kilograms where it matters)
     centres: NDArray[np.float64]  # [n, 2]   x, y of the centre of mass in its bin
     ids: tuple[str, ...]  # [n]       "" where unknown
@@ -172,10 +173,8 @@ class Plan:
             unit_mm: millimetres of a cell, if known.
         """
         n = int(bins.count[game])
-        labels = getattr(bins, "labels", None)
-        numbers, orientations = [-1] * n, None
-        if labels is not None:
-            numbers, orientations = labels[game, :n, 0].tolist(), labels[game, :n, 1].numpy()
+        numbers = bins.labels[game, :n, 0].tolist()
+        orientations = bins.labels[game, :n, 1].numpy()
         name: Callable[[int], str] = str if id_names is None else id_names.__getitem__
         return cls.of_boxes(
             bins.size, bins.boxes[game, :n].numpy(), bins.loads[game, :n].numpy(),

@@ -15,9 +15,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.options import EPILOG, add_options, choose
 from marl_pack.plan import Plan
 

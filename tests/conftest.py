@@ -11,7 +11,7 @@ from marl_pack.agents.heuristics import make_policy
 from marl_pack.bins import Bins
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import oriented
-from marl_pack.geometry.tensor import fits, resting_heights
+from marl_pack.geometry.tensor import resting_heights, windows_inside
 from marl_pack.stability import OrientedItem, Rule, orient_item
 
 torch.set_num_threads(1)
@@ -61,7 +61,7 @@ def random_maps(
 
     def anywhere(bins: Bins, item) -> torch.Tensor:
         top = resting_heights(bins.heightmap, item.sides) + item.sides[..., 2, None, None]
-        inside = fits(item.sides.flatten(0, 1).long(), *bins.size[:2])
+        inside = windows_inside(item.sides.flatten(0, 1).long(), *bins.size[:2])
         return (top <= bins.height) & inside.unflatten(0, item.sides.shape[:2])
 
     return random_play(anywhere, n, size, sides, steps, seed)

@@ -15,10 +15,10 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.search import SearchSettings
 from marl_pack.backend import Backend
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.config import ConfigError, parse
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import Items, independent, make_stream
 from marl_pack.plan_archive import load_plans
 from marl_pack.stability import RULES, reference

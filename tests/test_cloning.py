@@ -9,7 +9,7 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.policy import Policy
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.training.assembly import make_game, make_runner
 
 CLONING = (

@@ -21,8 +21,8 @@ from pettingzoo.test.state_test import state_test
 from pettingzoo.utils import wrappers
 
 from marl_pack import env_aec
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 
 O, P = "orientation_0", "placement_0"  # noqa: E741  # the two agents
 
@@ -441,6 +441,7 @@ def test_a_first_item_without_a_legal_cell_is_refused_at_reset() -> None:
         env.reset(seed=0)
 
 
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("illegal", ["terminate", "repair"])
 def test_without_a_mask_of_orientations_one_without_a_cell_ends_the_episode(illegal: str) -> None:
     # A bin of one column: an item 1 x 1 x 2 that lies has no place.

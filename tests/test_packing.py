@@ -6,9 +6,9 @@ from conftest import boxes_of
 from marl_pack.agents.heuristics import POLICIES, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.backend import Backend
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import check_items
 from marl_pack.stability import RULES, make_rule
 

@@ -16,10 +16,10 @@ from marl_pack.agents.learning.symmetry import mirror_rollout
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.kinds import observe
 from marl_pack.agents.policy import Policy
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.config import Config
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.training.assembly import evaluation, make_game, make_runner
 
 # --- what PPO records ---------------------------------------------------------------------------

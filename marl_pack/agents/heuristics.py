@@ -233,10 +233,8 @@ def make_placement_agent(
 
 
 def _unknown(kind: str, name: str, names: Sequence[str]) -> ValueError:
-    try:
-        renamed.refuse_old(name, renamed.POLICIES, kind)
-    except ValueError as error:
-        return error
+    if name in renamed.POLICIES:
+        return ValueError(f"{kind} {name!r} is now called {renamed.POLICIES[name]!r}")
     return ValueError(f"unknown {kind} {name!r}: one of {', '.join(names)}")
 
 

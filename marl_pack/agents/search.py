@@ -20,8 +20,8 @@ from torch import Tensor
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import Critic
 from marl_pack.agents.policy import Placement
-from marl_pack.bins import ORIENTATIONS, oriented
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.items import Stream
 
 AT_ONCE = 1 << 19

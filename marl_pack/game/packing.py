@@ -21,11 +21,12 @@ from torch import Tensor
 
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
-from marl_pack.bins import Bins, check_device, orientation_table
+from marl_pack.bins import Bins, check_device
 from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import GameState
 from marl_pack.game.turns import Oriented, Outcome
+from marl_pack.geometry import orientation_table
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.plan import Plan
@@ -243,7 +244,7 @@ class Packing:
         It changes nothing in the game.
 
         Args:
-            orientation: int64 [G], indices into :data:`marl_pack.bins.ORIENTATIONS`.
+            orientation: int64 [G], indices into :data:`marl_pack.geometry.ORIENTATIONS`.
         """
         return Oriented(self._sides(orientation), self.moves.of(orientation))
 

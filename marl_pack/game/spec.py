@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from marl_pack import renamed
-from marl_pack.bins import check_size
+from marl_pack.geometry import check_size
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import RULES, Rule, make_rule
 from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset

@@ -82,7 +82,7 @@ def slide(values: Tensor, w: Tensor, d: Tensor) -> Tensor:
     return values
 
 
-def fits(sides: Tensor, width: int, depth: int) -> Tensor:
+def windows_inside(sides: Tensor, width: int, depth: int) -> Tensor:
     """Return where a window of ``sides`` [B, 3] lies inside the map, bool [B, W, D].
 
     A box with a zero side fits nowhere.

@@ -51,7 +51,7 @@ def _tensor(heightmap: Tensor, sides: Tensor, height: int, waste: bool) -> tuple
     """Compute resting heights and wasted cells in tensor code."""
     n, count = sides.shape[:2]
     width, depth = heightmap.shape[1:]
-    inside = tensor.fits(sides.flatten(0, 1), width, depth).view(n, count, width, depth)
+    inside = tensor.windows_inside(sides.flatten(0, 1), width, depth).view(n, count, width, depth)
     resting_heights = tensor.resting_heights(heightmap, sides)
     wasted = torch.empty((0, 0, 0, 0), dtype=torch.int32, device=heightmap.device)
     if waste:

@@ -9,7 +9,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from marl_pack.bins import Size, check_size
+from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
 from marl_pack.items.random_numbers import draw, episode_keys
 

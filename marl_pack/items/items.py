@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from marl_pack.bins import ORIENTATIONS
+from marl_pack.geometry import ORIENTATIONS
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
-"""Numbers of the six orientations, :data:`marl_pack.bins.ORIENTATIONS`."""
+"""Numbers of the six orientations, :data:`marl_pack.geometry.ORIENTATIONS`."""
 UPRIGHT = (0, 1)
 """Orientations in which the item's own height stays vertical: this side up."""
 

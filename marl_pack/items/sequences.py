@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from marl_pack.backend import Backend
-from marl_pack.bins import ORIENTATIONS, Size
+from marl_pack.geometry import ORIENTATIONS, Size
 from marl_pack.items.items import ALL_ORIENTATIONS, ATTRIBUTES, KEYS, UPRIGHT, Attribute, Items
 from marl_pack.items.names import check_names
 

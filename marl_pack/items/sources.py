@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from numpy.typing import ArrayLike
 
-from marl_pack.bins import Size, check_size
+from marl_pack.geometry import Size, check_size
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import check_fields, read_fields
 from marl_pack.items.items import Items

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.geometry import MAX_HEIGHT
-from marl_pack.geometry.tensor import cut_windows, fits, shift, slide
+from marl_pack.geometry.tensor import cut_windows, shift, slide, windows_inside
 
 PAIR_CELLS = 1 << 24
 """Largest number of elements of the exact test's [windows, points, points, points] at a time."""
@@ -176,7 +176,7 @@ def support_mask(
     )
     limit = 2 * (height - flat[:, 2, None, None]) + 1
     within = (low > 0).all(1) & (start < flat[:, :2]).all(1)
-    possible = fits(flat, width, depth) & within[:, None, None]
+    possible = windows_inside(flat, width, depth) & within[:, None, None]
     possible &= (best % 2 == 1) & (best <= limit)
     mask = possible & (torch.minimum(torch.minimum(a, b), torch.minimum(c, e)) == best)
     for half in halves:

@@ -13,7 +13,7 @@ from numba import njit
 from torch import Tensor
 
 from marl_pack.geometry.compiled import mark_valid, slide
-from marl_pack.geometry.tensor import fits, resting_heights, window_sum
+from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
 
 Thresholds = tuple[tuple[float, int], ...]
 
@@ -100,7 +100,7 @@ def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thres
     flat = sides.flatten(0, 1).long()
     z = resting_heights(heightmap, sides)
     top = z + sides[..., 2, None, None].long()
-    possible = fits(flat, width, depth).view(z.shape) & (top <= height)
+    possible = windows_inside(flat, width, depth).view(z.shape) & (top <= height)
     w, d = flat[:, 0].clamp(1, width), flat[:, 1].clamp(1, depth)
     w, d = (side.view(n, count, 1, 1) for side in (w, d))
     area = torch.zeros_like(z, dtype=torch.int64)

@@ -11,9 +11,9 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.networks.heads import ScoreMap, pooled_head
 from marl_pack.agents.networks.planes import PLANES, Sight
 from marl_pack.agents.networks.trunk import Network
-from marl_pack.bins import ORIENTATIONS
 from marl_pack.game.moves import Floor
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 
 Choice = tuple[Tensor, ...]
 """The choices so far in a turn of the game: (), (orientation,) or (orientation, cell), int64
