@@ -56,7 +56,8 @@ def test_the_input_is_the_papers_four_channels_and_those_of_the_planes() -> None
     assert channels[0, 1:, 2, 2].tolist() == [2 / 4, 3 / 6, 4 / 8]
     assert (channels[0, 1:] == channels[0, 1:, :1, :1]).all()
     observation = observed("orientation", Packing(2, (6, 6, 6), sides=(2, 4)), ALL_PLANES)
-    assert input_channels(observation, ALL_PLANES).shape == (2, 4 + 7 * 6 + 4, 6, 6)
+    count = 4 + sum(PLANES[name].channels(6) for name in ALL_PLANES)
+    assert input_channels(observation, ALL_PLANES).shape == (2, count, 6, 6)
 
 
 @pytest.mark.parametrize("agent", AGENT_KINDS)

@@ -71,8 +71,9 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
     symmetries = torch.full((game.n,), symmetry)
     observation = observed(agent, game, orientation)
     expected = observed(agent, other, rotated)
-    pair = game.floor.pair(orientation, cell)
-    action = {"orientation": orientation, "placement": cell, "joint": pair}[agent]
+    kind, action = AGENT_KINDS[agent], orientation
+    if kind.acts_on_cells:
+        action = cell if kind.orientations == 1 else game.floor.pair(orientation, cell)
     mirrored, moved = transform(observation, action[:, None].float(), agent, symmetries)
     assert mirrored.keys() == expected.keys()
     for name, values in expected.items():
@@ -80,7 +81,7 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
             assert torch.allclose(mirrored[name], values, atol=1e-5), name
         else:
             assert torch.equal(mirrored[name], values), name
-    if agent == "orientation":
+    if not kind.acts_on_cells:
         assert torch.equal(moved.squeeze(1).long(), rotated)
         return
     # The box placed by the new action stands where the mirrored box would.

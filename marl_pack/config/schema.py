@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from marl_pack.agents.heuristics import POLICIES
 from marl_pack.agents.networks.trunk import Network
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.items import DEFAULT_SIDES
@@ -42,8 +43,8 @@ class Agent:
 
     Args:
         frozen: whether it plays without learning.
-        policy: who plays a frozen agent: random, dblf, height_min, best_fit, max_feasible, for the
-            orientation agent also first (as the item comes), or a run's folder or checkpoint.
+        policy: who plays a frozen agent: {policies}, for the orientation agent also first (as the
+            item comes), or a run's folder or checkpoint.
         network: shape of its network.
         teacher: the agent whose choices it clones at first, as for policy; null for none.
         teacher_iterations: for how many iterations it clones the teacher.
@@ -60,6 +61,9 @@ class Agent:
     learning_rate: float | None = None
     entropy_coef: float | None = None
     final_entropy_coef: float | None = None
+
+
+Agent.__doc__ = (Agent.__doc__ or "").replace("{policies}", ", ".join(POLICIES))
 
 
 @dataclass
