@@ -127,7 +127,7 @@ def choose_game(
     given = given_options(arguments)
     if "rule" in given:  # these belong to the rule
         learned = learned | {"margin": None, "thresholds": None}
-    items = str(arguments.items or learned.get("items", "rs"))
+    items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
     low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
     size = given.get("bin")
     if size is None and (arguments.items is None or items in GENERATED):

@@ -252,6 +252,7 @@ class Packing:
             branched.state.bins = branched.bins.for_boxes(most)
             branched.state.episode = episodes
             branched.state.stream = stream.start(seed, episodes)
+        branched._bins, branched._empty = branched.bins, self._empty[games]
         branched.turn = next(_turns)
         branched.moves = Moves(self.mask[games])
         branched.orientation_mask, branched.alive = self.orientation_mask[games], self.alive[games]

@@ -13,7 +13,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, TypeVar
 
 from marl_pack import renamed
@@ -73,10 +73,10 @@ def _thresholds(value: Any) -> str | None:
 
 def _orientations(value: Any) -> tuple[int, ...]:
     chosen = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    whole = all(isinstance(o, int) and not isinstance(o, bool) for o in chosen)
+    whole = all(isinstance(o, Integral) and not isinstance(o, bool) for o in chosen)
     if not chosen or not whole or not set(chosen) <= set(ALL_ORIENTATIONS):
         raise ValueError(f"{value!r}: need one or more of 0 … 5")
-    return tuple(sorted(set(chosen)))
+    return tuple(sorted({int(o) for o in chosen}))
 
 
 def _switch(value: Any) -> bool:
@@ -86,9 +86,10 @@ def _switch(value: Any) -> bool:
 
 
 def _max_items(value: Any) -> int | None:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if value is not None and not (whole and value >= 1):
         raise ValueError(f"{value!r}: needs a whole number ≥ 1, or none for no limit")
-    return value
+    return None if value is None else int(value)
 
 
 def _rule_name(rule: Any) -> str:
@@ -209,7 +210,7 @@ class GameSpec:
             renamed.refuse_old(name, renamed.OPTIONS, "option")
             if name not in names:
                 near = difflib.get_close_matches(name, names, 1)
-                guess = f"; did you mean {near[0]!r}?" if near else ""
+                guess = f"; did you mean {near[0]!r}?" if near else "."
                 raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
         return replace(self, **options) if options else self
 
