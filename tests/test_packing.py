@@ -360,6 +360,11 @@ def test_a_game_lost_without_a_cell_keeps_its_item_and_shows_no_action() -> None
     assert game.t.tolist() == [1, 0]
     assert game.items.sides.tolist() == [[1, 1, 1], [1, 1, 2]]
     assert game.orientation_mask.any(1).tolist() == [True, False]
+    loaded = Packing(
+        2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False
+    )
+    loaded.load_state_dict(game.state_dict())
+    assert loaded.alive.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("wrong", [(-1, 0), (6, 0), (2, -1), (2, 1), (1, 0)])
