@@ -129,7 +129,7 @@ def choose_game(
     chosen = given_options(arguments)
     if "rule" in chosen:  # these belong to the rule
         learned = learned | {"margin": None, "thresholds": None}
-    items = str(arguments.items or learned.get("items", "rs"))
+    items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
     low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
     size = chosen.get("bin")
     if size is None and (arguments.items is None or items in GENERATED):

@@ -91,7 +91,7 @@ def test_boxes_of_fewer_lengths_take_the_places_of_the_longest() -> None:
 
 
 def test_the_afterstate_value_is_the_reward_and_the_critics_value() -> None:
-    game, critic = in_play(5, 7, beta=0.5), varied_critic()
+    game, critic = in_play(5, 7, alpha=2.0, beta=0.5), varied_critic()
     lookahead = Lookahead(critic)
     values = lookahead.afterstate_value(game)
     assert (values[~game.mask] == ILLEGAL).all()
@@ -104,7 +104,7 @@ def test_the_afterstate_value_is_the_reward_and_the_critics_value() -> None:
         row = lookahead.afterstates(game).index[g, o, x, y][None]
         with torch.no_grad():
             value = critic(features(lookahead.afterstates(game), 1000, row))
-        expected = float(volume) / 1000 - 0.5 * float(waste) / 1000 + float(value)
+        expected = 2 * float(volume) / 1000 - 0.5 * float(waste) / 1000 + float(value)
         assert float(values[g, o, x, y]) == pytest.approx(expected, abs=1e-5)
 
 

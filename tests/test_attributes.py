@@ -122,6 +122,30 @@ def test_the_games_own_orientations_exclude_more() -> None:
     game = Packing(1, BIN, items, orientations=(0, 2))
     assert game.orientation_mask[0].tolist() == [True, False, True, False, False, False]
     assert game.orientation_sets == {(0, 2): 1 / 3, (2,): 1 / 3, (): 1 / 3}
+    items["orientations"] = [[0, 2], [0, 2, 4], [0, 1]]
+    sets = Packing(1, BIN, items, orientations=(0, 2)).orientation_sets
+    assert sets == {(0, 2): pytest.approx(2 / 3), (0,): pytest.approx(1 / 3)}
+
+
+def test_a_branch_counts_the_orientations_of_what_comes_there() -> None:
+    rows = [[1, 1, 1], [1, 1, 2], [1, 1, 1]]
+    free = Packing(1, (1, 2, 4), {"items": rows})
+    standing = Packing(1, (1, 2, 4), {"items": rows, "upright": [True] * 3})
+    one = torch.tensor([0])
+    branch = free.branch(one, independent(standing.stream), 0, one)
+    assert branch.orientation_sets == {(0, 1): 1.0}
+    assert free.orientation_sets == {(0, 1, 2, 3, 4, 5): 1.0}
+    chance = Lookahead().feasible_probability
+    assert torch.equal(chance(branch)[0, 0], chance(standing)[0, 0])
+    assert (chance(branch)[0, 0] < chance(free)[0, 0])[free.mask[0, 0]].all()
+
+
+def test_a_negative_id_is_kept() -> None:
+    items = {"items": [[2, 2, 2], [3, 3, 3], [4, 4, 4]], "ids": [-5, -1, 7]}
+    game = Packing(1, BIN, items, auto_reset=False)
+    while game.alive.any():
+        game.place(*make_policy("dblf")(game))
+    assert game.plans()[0].ids == ("-5", "-1", "7")
 
 
 def test_the_environment_shows_and_plays_only_what_items_allow() -> None:

@@ -143,6 +143,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
     [
         ("--policy nobody", "'nobody': needs one of"),
         ("--items missing.npz", "no such file"),
+        ("--items=", "no such file"),
         ("--items sr", "unknown items|no such file"),
         ("--episodes 0", "--episodes 0"),
         ("--margin -1", "margin"),

@@ -395,6 +395,7 @@ def test_sequences_of_unequal_length_keep_their_attributes(tmp_path: Path) -> No
         ("upright", "maybe", "upright .*; needs true or false"),
         ("upright", 2, "upright .*; needs true or false"),
         ("orientations", [0, 6], "orientations .*; needs one or more of the numbers 0 … 5"),
+        ("orientations", [0, 0, 1, 0, 0, 0], "orientations .*; needs .*, each once"),
         ("orientations", [-1], "orientations .*; needs"),
         ("quantity", 0, "quantity .*; needs a whole number ≥ 1"),
         ("quantity", 1.5, "quantity .*; needs a whole number ≥ 1"),

@@ -6,6 +6,7 @@ from conftest import boxes_of
 from marl_pack.agents.heuristics import POLICIES, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.backend import Backend
+from marl_pack.game.moves import Floor, Moves
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS
@@ -341,7 +342,81 @@ def test_an_unmasked_orientation_without_a_cell_ends_the_episode_with_nothing_pl
         assert game.bins.filled.tolist() == [3, 0]
 
 
+@pytest.mark.parametrize("backend", Backend)
+def test_an_episode_goes_on_as_usual_after_one_lost_without_a_cell(backend: Backend) -> None:
+    game = Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, backend=backend)
+    upright, lying = 0, int((~game.mask[0].flatten(1).any(1)).nonzero()[0])
+    game.place(torch.tensor([lying, lying]), torch.tensor([0, 0]))
+    assert not game.state.lost.any()
+    assert game.mask[:, upright].all()
+    outcome = game.place(torch.tensor([upright, upright]), torch.tensor([0, 0]))
+    assert outcome.placed.tolist() == [1, 1]
+
+
+def test_a_game_lost_without_a_cell_keeps_its_item_and_shows_no_action() -> None:
+    game = Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False)
+    lying = int((~game.mask[0].flatten(1).any(1)).nonzero()[0])
+    game.place(torch.tensor([0, lying]), torch.tensor([0, 0]))
+    assert game.t.tolist() == [1, 0]
+    assert game.items.sides.tolist() == [[1, 1, 1], [1, 1, 2]]
+    assert game.orientation_mask.any(1).tolist() == [True, False]
+    loaded = Packing(
+        2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False
+    )
+    loaded.load_state_dict(game.state_dict())
+    assert loaded.alive.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("wrong", [(-1, 0), (6, 0), (2, -1), (2, 1), (1, 0)])
+def test_without_a_mask_of_orientations_an_impossible_action_is_refused_too(
+    wrong: tuple[int, int],
+) -> None:
+    """Orientations 0 and 2 to 5 may be chosen, of which 0 alone has a cell."""
+    game = Packing(
+        1, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False,
+        orientations=(0, 2, 3, 4, 5),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="choose where the mask is true"):
+        game.place(torch.tensor([wrong[0]]), torch.tensor([wrong[1]]))
+    assert game.place(torch.tensor([5]), torch.tensor([0])).done.all()
+
+
+def test_the_least_of_real_keys_is_legal_and_the_nearest_cell_counts_x_and_y() -> None:
+    mask = torch.zeros(1, 6, 3, 4, dtype=torch.bool)
+    mask[0, 2, 1, 3] = mask[0, 4, 2, 0] = True
+    key = torch.zeros(1, 6, 3, 4)
+    key[0, 2, 1, 3], key[0, 4, 2, 0] = 8.0, 7.0
+    orientation, cell = Moves(mask).least(key)
+    assert (orientation.tolist(), cell.tolist()) == ([4], [8])
+    floor = Floor(3, 4)
+    corners = np.array([floor.cell(0, 3), floor.cell(1, 0), floor.cell(2, 2)])
+    assert floor.nearest(floor.cell(0, 1), corners) == floor.cell(1, 0)
+    assert floor.nearest(floor.cell(1, 2), corners) == floor.cell(2, 2)
+
+
+def test_a_branch_that_is_reset_leaves_the_games_it_came_from() -> None:
+    game = Packing(4, auto_reset=False)
+    first = torch.zeros(4, dtype=torch.int64)
+    game.place(first, game.mask[:, 0].flatten(1).int().argmax(1))
+    for chosen in ([0, 2], [3, 1, 1, 0]):
+        branch = game.branch(torch.tensor(chosen))
+        branch.reset(seed=5)
+        assert branch.bins.count.tolist() == [0] * len(chosen)
+        assert branch.episode.tolist() == list(range(len(chosen)))
+        assert game.bins.count.tolist() == [1] * 4
+
+
+def test_options_may_be_numpy_numbers() -> None:
+    game = Packing(1, orientations=np.array([4, 0]), max_items=np.int64(3))
+    assert (game.spec.orientations, game.spec.max_items) == ((0, 4), 3)
+    assert type(game.spec.max_items) is int
+    with pytest.raises(ValueError, match="need one or more of 0"):
+        Packing(1, orientations=np.array([True, False]))
+
+
 def test_an_unknown_option_is_named_with_the_nearest_one() -> None:
+    with pytest.raises(TypeError, match=r"unexpected option 'zzz'\. Options: bin, "):
+        Packing(1, zzz=1)
     with pytest.raises(TypeError, match="unexpected option 'margn'; did you mean 'margin'"):
         Packing(1, margn=1)
     with pytest.raises(ValueError, match="option 'size' is now called 'bin'"):

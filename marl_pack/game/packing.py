@@ -222,6 +222,7 @@ class Packing:
             branched.state.bins = branched.bins.for_boxes(most)
             branched.state.episode = episodes
             branched.state.stream = stream.start(seed, episodes)
+        branched._bins = branched.state.bins
         branched.turn = object()
         branched.moves = Moves(self.mask[games])
         branched.orientation_mask, branched.alive = self.orientation_mask[games], self.alive[games]

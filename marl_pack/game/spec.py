@@ -213,7 +213,7 @@ class GameSpec:
             renamed.refuse_old(name, renamed.OPTIONS, "option")
             if name not in names:
                 near = difflib.get_close_matches(name, names, 1)
-                guess = f"; did you mean {near[0]!r}?" if near else ""
+                guess = f"; did you mean {near[0]!r}?" if near else "."
                 raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
         return replace(self, **options) if options else self
 

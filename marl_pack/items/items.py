@@ -163,6 +163,8 @@ def _whole(value: Any) -> int:
 def _orientation_mask(value: Any) -> NDArray[np.bool_]:
     """Return bool [6] from a list of numbers 0 … 5, or a text of them."""
     numbers = value.replace(",", " ").split() if isinstance(value, str) else list(value)
+    if len({_whole(n) for n in numbers}) < len(numbers):  # such as flags 0 and 1
+        raise ValueError(value)
     return np.isin(ALL_ORIENTATIONS, [ALL_ORIENTATIONS.index(_whole(n)) for n in numbers])
 
 
@@ -181,8 +183,8 @@ ATTRIBUTES = (
         lambda values: np.ones(len(values), bool),
     ),
     Attribute(
-        "orientations", "orientations", "one or more of the numbers 0 … 5", (6,), np.bool_, "b",
-        _orientation_mask, lambda values: np.array(values.any(1), bool),
+        "orientations", "orientations", "one or more of the numbers 0 … 5, each once", (6,),
+        np.bool_, "b", _orientation_mask, lambda values: np.array(values.any(1), bool),
     ),
     Attribute(
         "id", "ids", "a text or a whole number", (), np.object_, "iuU", _id,

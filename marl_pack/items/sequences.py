@@ -324,12 +324,13 @@ def number_ids(ids: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[str, ...] | 
     """Return ids as whole numbers: the ids themselves, or indices into texts, returned as well.
 
     Args:
-        ids: texts and whole numbers [R]. Texts such as "007" are not numbers.
+        ids: texts and whole numbers [R]. Texts such as "007" are not numbers, and negative numbers
+            are texts: a label below 0 says that an id is unknown.
     """
     texts = ids.astype(str)
     try:
         numbers = ids.astype(np.int64)
-        if (numbers.astype(str) == texts).all():
+        if (numbers >= 0).all() and (numbers.astype(str) == texts).all():
             return numbers, None
     except (ValueError, OverflowError):
         pass
