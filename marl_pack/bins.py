@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -92,16 +93,18 @@ class Bins:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Bins:
         """Return the bins with ``change`` applied to every tensor."""
-        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in TENSORS}
-        return replace(self, **changed)
+        # By position: dataclasses.replace takes as long as the changes themselves.
+        values: list[Any] = [*map(change, self.tensors()), self.height, self.backend]
+        return Bins(*values)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return all tensors, in the order of the fields."""
-        return tuple(getattr(self, name) for name in TENSORS)
+        return _tensors_of(self)
 
 
 TENSORS = tuple(f.name for f in fields(Bins) if f.type == "Tensor")
-"""Names of the fields of :class:`Bins` that are tensors."""
+"""Names of the fields of :class:`Bins` that are tensors; they come first."""
+_tensors_of: Callable[[Bins], tuple[Tensor, ...]] = attrgetter(*TENSORS)
 
 
 def empty(

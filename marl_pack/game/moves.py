@@ -8,6 +8,7 @@ environments compute these numbers only here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -130,7 +131,7 @@ class Moves:
             orientation: int64 [G].
             cell: int64 [G].
         """
-        games = torch.arange(len(values), device=values.device)
+        games = _numbers(len(values), values.device)
         if cell is None:
             return values[games, orientation]
         return values[games, orientation].flatten(1)[games, cell]
@@ -197,6 +198,12 @@ class LegalMoves:
             if items.orientations is not None:
                 possible &= items.orientations
         return possible, alive
+
+
+@cache
+def _numbers(n: int, device: torch.device) -> Tensor:
+    """Return 0 … n - 1, int64 [n]."""
+    return torch.arange(n, device=device)
 
 
 @njit(cache=True)

@@ -102,33 +102,6 @@ def _clear_unfit(sides: Any, width: int, depth: int, height: int, out: Any) -> N
 
 
 @njit(cache=True, inline="always")
-def _decide_run(
-    window: Any, spare: Any, out: Any, depth: int, w: int, d: int, tops: Any, codes: Any
-) -> None:
-    """Decide all windows of a run from the quadrants around their middles.
-
-    Args:
-        window: [run's cells], K of each mask's map.
-        spare: [run's cells], scratch.
-        out: [run's cells], scratch.
-        depth: D.
-        w: the run's footprint along x.
-        d: the run's footprint along y.
-        tops: [run's cells], see :func:`_decide`.
-        codes: uint8 [run's cells], see :func:`_decide`.
-    """
-    half_w, half_d = (w + 1) // 2, (d + 1) // 2
-    best = slide(window, spare, out, depth, half_w, half_d)
-    m = window.size - (w - 1) * depth - (d - 1)
-    sx, sy = (w - half_w) * depth, d - half_d
-    _decide(
-        best[:m], best[sy : sy + m], best[sx : sx + m], best[sx + sy : sx + sy + m], tops[:m],
-        codes[:m],
-    )  # fmt: skip
-    codes[m:] = 0
-
-
-@njit(cache=True, inline="always")
 def _copy_equals(equal: Any, out: Any, best_level: Any) -> None:
     """Copy the results of oriented items [N · A] to those with equal sides.
 
@@ -171,6 +144,7 @@ def central_masks(
     gathered = np.empty((3, size * cells), levels.dtype)
     tops = np.empty(size * cells, levels.dtype)
     codes, valid = np.empty((size, cells), np.uint8), np.empty(cells, np.uint8)
+    flat_codes = codes.reshape(size * cells)
     scratch = np.empty((3, 2 * width + 2, 2), np.int64)
     _clear_unfit(flat_sides, width, depth, height, flat_out)
     marked = 0, 0
@@ -193,8 +167,15 @@ def central_masks(
                 _load(
                     flat_levels[batch[j] // count], top, valid, window[part], tops[part], codes[j]
                 )
-        flat_codes = codes.reshape(size * cells)[:total]
-        _decide_run(window, gathered[1], gathered[2], depth, w, d, tops, flat_codes)
+        half_w, half_d = (w + 1) // 2, (d + 1) // 2
+        best = slide(window, gathered[1], gathered[2], depth, half_w, half_d)
+        m = total - (w - 1) * depth - (d - 1)
+        sx, sy = (w - half_w) * depth, d - half_d
+        _decide(
+            best[:m], best[sy : sy + m], best[sx : sx + m], best[sx + sy : sx + sy + m], tops[:m],
+            flat_codes[:m],
+        )  # fmt: skip
+        flat_codes[m:total] = 0
         for j in range(batch.size):
             i = batch[j]
             if _write_mask(codes[j], flat_out[i]):
