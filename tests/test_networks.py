@@ -215,6 +215,28 @@ def test_a_game_that_has_ended_has_the_best_value_zero() -> None:
     assert input_channels(observation, ["afterstate_value"]).abs().max() <= 1
 
 
+def test_the_orientation_agent_observes_what_may_be_chosen() -> None:
+    game = Packing(1, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False)
+    assert observed("orientation", game, ())["mask"].all()
+    assert not game.moves.orientations.all()
+
+
+ONLY_TWO: list[dict[str, object]] = [
+    {"orientations": [0, 4]}, {"items": {"items": [[2, 3, 4]], "orientations": [[0, 4]]}}
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("options", ONLY_TWO)
+def test_planes_show_nothing_of_orientations_that_are_barred(options: dict[str, object]) -> None:
+    game = Packing(4, **{"items": [[2, 3, 4]]} | options)
+    game.bins.heightmap.fill_(2)
+    game.bins.heightmap[:, 3, 3] = 5
+    observation = observed("orientation", game, ("resting_height", "waste"))
+    for name in ("resting_height", "waste"):
+        shown = observation[name].flatten(2).amax(2) != observation[name].flatten(2).amin(2)
+        assert shown.tolist() == [[True, False, False, False, True, False]] * 4, name
+
+
 @pytest.mark.parametrize("agent", AGENT_KINDS)
 def test_a_new_agent_is_nearly_indifferent(agent: str) -> None:
     game = Packing(4, seed=1)
