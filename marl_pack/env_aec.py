@@ -184,10 +184,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             raise ValueError(f"max_cycles = {max_cycles}: needs at least 1, or None for no limit")
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
+        if "bin" in options:
+            raise TypeError("unexpected option 'bin'; did you mean 'bin_size'?")
         self._spec = GameSpec(bin=bin_size).with_options(options)
-        self._stream_game = Packing(
-            1, items=items, spec=self._spec, sides=sides, auto_reset=False
-        )  # fmt: skip
+        self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
         self._unit = max(self._game.size)
         self._episode = -1

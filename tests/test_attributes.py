@@ -239,3 +239,14 @@ def test_without_a_mask_of_orientations_an_item_still_bars_its_own() -> None:
     outcome = game.place(torch.tensor([2]), torch.tensor([0]))
     assert bool(outcome.done)
     assert int(outcome.placed) == 1
+
+
+def test_a_branch_with_items_of_other_ids_names_no_box_wrongly() -> None:
+    game = Packing(1, items={"items": [[2, 2, 3], [2, 2, 2], [1, 1, 1]], "ids": ["a", "b", "c"]})
+    game.place(*make_policy("dblf")(game))
+    future = make_stream({"items": [[1, 1, 2]] * 3, "ids": ["x", "y", "z"]}, game.size)
+    for stream, last in ((future, "z"), (make_stream("rs", game.size), "2")):
+        branch = game.branch(torch.tensor([0]), stream, 0, torch.tensor([0]))
+        for _ in range(2):
+            branch.place(*make_policy("dblf")(branch))
+        assert branch.plans()[0].ids == ("", "", last)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -45,16 +47,19 @@ def test_heightmap_minus_empty_map_counts_the_cells_of_the_boxes() -> None:
         assert int(bins.filled[i]) == filled.sum()
 
 
-def test_a_zero_sided_box_changes_nothing() -> None:
-    bins = stack((4, 4, 4), (0, 0, 0, 2, 2, 2))
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize("sides", [(0, 0, 0), (3, 2, 0), (0, 3, 2)])
+def test_a_zero_sided_box_changes_nothing(sides: tuple[int, int, int], backend: Backend) -> None:
+    bins = replace(stack((4, 4, 4), (0, 0, 0, 2, 2, 2)), backend=backend)
     before = bins.clone()
-    state.place(bins, torch.zeros(1, 3, dtype=torch.int16), torch.tensor([[0, 0]]))
+    state.place(bins, torch.tensor([sides], dtype=torch.int16), torch.tensor([[0, 0]]))
     for now, then in zip(bins.tensors(), before.tensors(), strict=True):
         assert torch.equal(now, then)
 
 
-def test_labels_are_stored_with_the_boxes_and_unknown_by_default() -> None:
-    bins = state.empty(2, (4, 4, 9), max_boxes=2)
+@pytest.mark.parametrize("backend", Backend)
+def test_labels_are_stored_with_the_boxes_and_unknown_by_default(backend: Backend) -> None:
+    bins = state.empty(2, (4, 4, 9), max_boxes=2, backend=backend)
     boxes = torch.tensor([[2, 2, 1], [1, 3, 2]], dtype=torch.int16)
     state.place(
         bins,

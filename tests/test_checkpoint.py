@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from marl_pack.agents.learning import checkpoint as checkpoints
-from marl_pack.agents.loading import Loader, load_actor, record_of
+from marl_pack.agents.loading import Loader, load_actor, load_afterstate_critic, record_of
 from marl_pack.agents.policy import in_turns
+from marl_pack.agents.search import SearchSettings
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
+from marl_pack.items import make_stream
 from marl_pack.train import main as train
 
 
@@ -120,3 +122,28 @@ def test_mismatched_weights_and_missing_agents_are_named(runs: Path) -> None:
 def test_a_checkpoint_needs_no_code_to_be_trusted(runs: Path) -> None:
     for name in ("latest.pt", "best.pt", "model_0.pt"):
         torch.load(runs / "both" / name, weights_only=True)
+
+
+def test_a_depth_needs_a_critic_that_estimates_shares_of_the_bin(runs: Path) -> None:
+    checkpoint = checkpoints.read(runs / "both")
+    futures, depth = make_stream("rs", (10, 10, 10)), SearchSettings(depth=1)
+    assert Loader(seed=3).planner(checkpoint, depth, futures).seed == -4
+    for section, key in (("game", "alpha"), ("ppo", "gamma")):
+        config = checkpoint["config"]
+        other = config | {section: config[section] | {key: 0.5}}
+        with pytest.raises(ValueError, match="a depth needs agents trained with"):
+            Loader().planner(checkpoint | {"config": other}, depth, futures)
+        Loader().planner(checkpoint | {"config": other}, SearchSettings(), futures)
+
+
+def test_a_frozen_agent_that_plays_at_random_has_the_seed_of_the_evaluation(runs: Path) -> None:
+    checkpoint = checkpoints.read(runs / "frozen")
+    game = Packing(64)
+    first, same, other = (Loader(seed=s).policy_of(checkpoint)(game)[0] for s in (1, 1, 2))
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_a_critic_of_afterstates_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="the critic of afterstates does not match"):
+        load_afterstate_critic({"afterstate_critic": {"wrong": torch.zeros(1)}}, "cpu")

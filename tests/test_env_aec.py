@@ -525,3 +525,8 @@ def test_every_orientation_is_named_by_its_row() -> None:
         env.step(o)
         lying = (env.state()[1:4, 0, 0] * 10).round().astype(int).tolist()
         assert lying == [(2, 3, 4)[axis] for axis in permutation]
+
+
+def test_the_bin_of_the_environment_has_one_name() -> None:
+    with pytest.raises(TypeError, match="did you mean 'bin_size'"):
+        env_aec.raw_env((6, 6, 6), bin=(8, 8, 8))

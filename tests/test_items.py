@@ -623,3 +623,13 @@ def test_generated_items_may_take_every_orientation() -> None:
         assert items.orientations is None
         assert stream.id_names is None
         assert stream.orientation_sets == {(0, 1, 2, 3, 4, 5): 1.0}
+
+
+def test_commas_after_the_last_column_are_ignored(tmp_path: Path) -> None:
+    (tmp_path / "sheet.csv").write_text("w,d,h,,\n2,3,4,,\n1,1,1,,\n")
+    sequences, _ = load(tmp_path / "sheet.csv", BIN)
+    item = sequences.item(sequences.start(0, torch.tensor([0])), torch.tensor([1]))
+    assert item.sides.tolist() == [[1, 1, 1]]
+    (tmp_path / "more.csv").write_text("w,d,h,\n2,3,4,5\n")
+    with pytest.raises(ValueError, match="row 0"):
+        load(tmp_path / "more.csv", BIN)

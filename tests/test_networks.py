@@ -1,11 +1,13 @@
 """The agents' networks: their inputs, any bin size, shared trunks, and the kinds of agents."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic
-from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.afterstates.lookahead import ILLEGAL, Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice, observe
@@ -173,6 +175,78 @@ def test_feasible_cells_are_observed_relative_to_the_best_placement() -> None:
     observation = observed("placement", game, ("feasible_cells",), orientation)
     oriented = input_channels(observation, ["feasible_cells"])
     assert torch.equal(oriented[:, 4], near[torch.arange(4), orientation])
+
+
+def encoded(name: str, **observation: object) -> list[list[float]]:
+    """Return the channels of one plane, from rows of a 1 × D floor, as rows."""
+    tensors = {key: torch.tensor(value) for key, value in observation.items()}
+    channels = PLANES[name].encode({"heightmap": torch.zeros(1, 1, 4), **tensors})
+    return torch.cat(channels, 1)[0].flatten(1).tolist()
+
+
+def test_values_are_seen_as_what_they_lack_of_the_best() -> None:
+    channels = encoded(
+        "afterstate_value", afterstate_value=[[[[0.5, 0.4975, 0.475, ILLEGAL]]]],
+        best_afterstate_value=[[0.5]],
+    )  # fmt: skip
+    expected = [[1, 0.95, 0.5, 0], [1, 0.5, 0, 0], [0.5] * 4]
+    assert channels == [pytest.approx(row, abs=1e-5) for row in expected]
+
+
+def test_a_cell_that_is_not_legal_is_never_near_the_most_feasible_cells() -> None:
+    channels = encoded(
+        "feasible_cells", feasible_cells=[[[[0.0, 0.1, 0.05, 0.0]]]], most_feasible_cells=[[0.1]]
+    )
+    near = 1 + 5 * (math.log1p(0.05) - math.log1p(0.1))
+    assert channels[0] == pytest.approx([0, 1, near, 0], abs=1e-5)
+
+
+def test_waste_is_a_share_of_the_item_and_finite_without_one() -> None:
+    row = [[[[7, 0, 14, 1]]]]
+    assert encoded("waste", waste=row, item=[[1, 2, 3]])[0] == pytest.approx([1, 0, 2, 1 / 7])
+    assert encoded("waste", waste=row, item=[[0, 0, 0]])[0] == pytest.approx([7, 0, 14, 1])
+
+
+def test_a_game_that_has_ended_has_the_best_value_zero() -> None:
+    game = Packing(2, (4, 4, 4), [[4, 4, 2], [4, 4, 4]], auto_reset=False)
+    game.place(torch.zeros(2, dtype=torch.int64), torch.zeros(2, dtype=torch.int64))
+    assert not game.alive.any()
+    observation = observed("orientation", game, ("afterstate_value",))
+    assert observation["best_afterstate_value"].tolist() == [[0.0], [0.0]]
+    assert input_channels(observation, ["afterstate_value"]).abs().max() <= 1
+
+
+def test_the_orientation_agent_observes_what_may_be_chosen() -> None:
+    game = Packing(1, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False)
+    assert observed("orientation", game, ())["mask"].all()
+    assert not game.moves.orientations.all()
+
+
+ONLY_TWO: list[dict[str, object]] = [
+    {"orientations": [0, 4]}, {"items": {"items": [[2, 3, 4]], "orientations": [[0, 4]]}}
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("options", ONLY_TWO)
+def test_planes_show_nothing_of_orientations_that_are_barred(options: dict[str, object]) -> None:
+    game = Packing(4, **{"items": [[2, 3, 4]]} | options)
+    game.bins.heightmap.fill_(2)
+    game.bins.heightmap[:, 3, 3] = 5
+    observation = observed("orientation", game, ("resting_height", "waste"))
+    for name in ("resting_height", "waste"):
+        shown = observation[name].flatten(2).amax(2) != observation[name].flatten(2).amin(2)
+        assert shown.tolist() == [[True, False, False, False, True, False]] * 4, name
+
+
+@pytest.mark.parametrize("agent", AGENT_KINDS)
+def test_a_new_agent_is_nearly_indifferent(agent: str) -> None:
+    game = Packing(4, seed=1)
+    torch.manual_seed(0)
+    actor = make_actor(agent, SMALL, "cpu")
+    observation = observed(agent, game, ())
+    probability, mask = actor.log_probs(observation).exp(), observation["mask"]
+    uniform = mask / mask.sum(1, keepdim=True)
+    assert torch.allclose(probability, uniform, rtol=0.05, atol=1e-6)
 
 
 def test_an_observation_does_not_change_when_the_game_goes_on() -> None:

@@ -478,3 +478,16 @@ def test_a_state_of_other_games_is_refused_and_changes_nothing() -> None:
     with pytest.raises(ValueError, match="needs the items of this game"):
         game.load_state_dict(Packing(2, items="cut1").state_dict())
     assert all(torch.equal(value, state[name]) for name, value in game.state_dict().items())
+
+
+def test_a_state_is_copied_and_one_of_other_games_is_refused() -> None:
+    game, other = Packing(2, seed=1), Packing(2, seed=2)
+    heightmap = game.bins.heightmap.clone()
+    other.set_state(game.state)
+    other.place(*make_policy("dblf")(other))
+    assert torch.equal(game.bins.heightmap, heightmap)
+    with pytest.raises(ValueError, match="heightmap is"):
+        Packing(3).set_state(game.state)
+    upright = Packing(2, items={"items": [[2, 3, 4]], "upright": [True]})
+    with pytest.raises(ValueError, match=r"has no items\.orientations"):
+        game.set_state(upright.state)

@@ -95,6 +95,10 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
     assert torch.equal(raised[going_on], (other.bins.heightmap - after)[going_on])
 
 
+def test_a_square_bin_has_eight_symmetries_and_another_one_four() -> None:
+    assert [count(*size) for size in ((5, 5), (5, 7))] == [8, 4]
+
+
 def test_a_bin_that_is_not_square_is_mirrored() -> None:
     game = played((7, 5, 8))
     observation = observed("orientation", game, torch.zeros(game.n, dtype=torch.int64))

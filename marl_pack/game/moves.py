@@ -8,7 +8,7 @@ environments compute these numbers only here.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -200,7 +200,7 @@ class LegalMoves:
         return possible, alive
 
 
-@cache
+@lru_cache(maxsize=64)
 def _numbers(n: int, device: torch.device) -> Tensor:
     """Return 0 … n - 1, int64 [n]."""
     return torch.arange(n, device=device)

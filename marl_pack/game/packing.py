@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
-from marl_pack.bins import Bins, check_device
+from marl_pack.bins import UNKNOWN, Bins, check_device
 from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import GameState
@@ -165,13 +166,18 @@ class Packing:
         t = torch.zeros_like(episode)
         stream = self.stream.start(self.seed, episode)
         lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
-        self.set_state(GameState(self._bins, self.stream.item(stream, t), episode, t, lost, stream))
+        self.state = GameState(self._bins, self.stream.item(stream, t), episode, t, lost, stream)
+        self._find_moves()
         if self.auto_reset:
             self._restart(~self.alive)
 
     def set_state(self, state: GameState) -> None:
-        """Put the games into a state, such as one that :meth:`GameState.select` returned."""
-        self.state = state
+        """Put the games into a copy of a state, such as one of :meth:`GameState.select`.
+
+        Raises:
+            ValueError: if it is of other games; nothing has changed then.
+        """
+        self.state.load(state.tensors())
         self._find_moves()
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -185,8 +191,8 @@ class Packing:
         Raises:
             ValueError: if it is of other games.
         """
-        own = torch.tensor(fingerprint(self.stream))
-        if not torch.equal(tensors.get("items_fingerprint", ~own).cpu(), own):
+        tensors, own = dict(tensors), torch.tensor(fingerprint(self.stream))
+        if not torch.equal(tensors.pop("items_fingerprint", ~own).cpu(), own):
             raise ValueError(
                 "state of another game: needs the items of this game; was their file changed?"
             )
@@ -206,7 +212,8 @@ class Packing:
 
         Args:
             games: int64 [K], the games to copy; one may come several times.
-            stream: of the items after the visible ones; this game's by default.
+            stream: of the items after the visible ones; this game's by default. If its ids have
+                other texts, the boxes that the copies begin with have no ids in :meth:`plans`.
             seed, episodes: int64 [K], the episodes of ``stream`` that come.
         """
         branched = copy.copy(self)
@@ -220,6 +227,10 @@ class Packing:
             branched.orientation_sets = _orientation_sets(stream, self.spec)
             most = self._most_items(min(self.stream.smallest, stream.smallest), None)
             branched.state.bins = branched.bins.for_boxes(most)
+            if stream.id_names != self.stream.id_names:
+                branched.bins.labels[..., 0] = UNKNOWN
+                ids = torch.full_like(branched.t, UNKNOWN)
+                branched.state.items = replace(branched.items, ids=ids)
             branched.state.episode = episodes
             branched.state.stream = stream.start(seed, episodes)
         branched._bins = branched.state.bins

@@ -46,9 +46,12 @@ class GameState:
             tensors: as :meth:`tensors` names them.
 
         Raises:
-            ValueError: if one is missing or has another shape; nothing has changed then.
+            ValueError: if one is missing, unknown or has another shape; nothing has changed then.
         """
         own = self.tensors()
+        unknown = sorted(set(tensors) - set(own))
+        if unknown:
+            raise ValueError(f"state of another game: this one has no {', '.join(unknown)}")
         for name, tensor in own.items():
             if name not in tensors or tensors[name].shape != tensor.shape:
                 shape = list(tensors[name].shape) if name in tensors else "missing"

@@ -104,12 +104,16 @@ def _read_table(path: Path) -> dict[str, list[str]]:
         raise ValueError(f"{path}: not readable as UTF-8 text ({error})") from None
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     columns = [name.strip() for name in next(reader, [])]
+    while columns and not columns[-1]:  # spreadsheets write a comma after the last column
+        columns.pop()
     check_names(columns, COLUMNS, SIDES, str(path), "column")
     if len(set(columns)) < len(columns):
         raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
     places = [columns.index(name) for name in SIDES]
     cells: list[str] = []  # row by row in one list: a list for each row is three times slower
     for row in filter(None, reader):
+        if len(row) > len(columns) and not any(row[len(columns) :]):
+            del row[len(columns) :]
         try:
             for place in places:
                 float(row[place])

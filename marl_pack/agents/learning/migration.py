@@ -31,11 +31,10 @@ def from_format_1(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
         name: _agent(record, learns="optimizer_state_dict" in record)
         for name, record in checkpoint["agents"].items()
     }
-    for name, record in checkpoint["agents"].items():
+    for record in checkpoint["agents"].values():
         critic = _critic(record.get("actor_state_dict", {}))
         if critic and "optimizer_state_dict" in record:  # the run's own, the same in each agent
             migrated["afterstate_critic"] = critic
-            migrated["agents"][name].pop("afterstate_critic", None)
     if "afterstates" in migrated:
         migrated["afterstate_optimizer"] = migrated.pop("afterstates")
     if "state" in migrated:

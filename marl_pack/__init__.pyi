@@ -1,0 +1,31 @@
+# The public interface: __init__.py imports these names at their first use.
+
+from .agents.heuristics import POLICIES as POLICIES
+from .agents.heuristics import make_policy as make_policy
+from .agents.loading import Loader as Loader
+from .agents.policy import Policy as Policy
+from .agents.search import Planner as Planner
+from .agents.search import SearchSettings as SearchSettings
+from .backend import Backend as Backend
+from .env_aec import env as env
+from .env_aec import parallel_env as parallel_env
+from .evaluation.rollout import Rollout as Rollout
+from .game.moves import Moves as Moves
+from .game.packing import Packing as Packing
+from .game.spec import GameSpec as GameSpec
+from .game.state import GameState as GameState
+from .game.turns import Outcome as Outcome
+from .geometry import ORIENTATIONS as ORIENTATIONS
+from .items import Items as Items
+from .items import Stream as Stream
+from .items import make_stream as make_stream
+from .plan import Plan as Plan
+from .sapien_check import Stack as Stack
+from .sapien_check import check as check
+from .stability import RULES as RULES
+from .stability import OrientedItem as OrientedItem
+from .stability import Rule as Rule
+from .stability import make_rule as make_rule
+from .stability import stable_mask as stable_mask
+
+__version__: str

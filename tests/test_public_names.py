@@ -1,0 +1,25 @@
+"""The public interface of the package: its names, and that importing it is fast."""
+
+import subprocess
+import sys
+
+import pytest
+
+import marl_pack
+
+
+@pytest.mark.parametrize("name", marl_pack.__all__)
+def test_a_public_name_is_what_its_module_defines(name: str) -> None:
+    value = getattr(marl_pack, name)
+    module = getattr(value, "__module__", "")
+    assert not module.startswith("marl_pack") or getattr(sys.modules[module], name) is value
+
+
+def test_importing_the_package_alone_loads_no_torch() -> None:
+    code = "import marl_pack, sys; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="Pakcing"):
+        marl_pack.Pakcing  # type: ignore[attr-defined]  # noqa: B018
