@@ -176,18 +176,17 @@ def central_masks(
             flat_codes[:m],
         )  # fmt: skip
         flat_codes[m:total] = 0
-        _write_run(batch, w, d, codes, tops, levels, scratch, out, flat_best)
+        _write_run(batch, w, d, codes, tops, levels, scratch, out, flat_out, flat_best)
     _copy_equals(equal, flat_out, flat_best)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _write_run(
     batch: Any, w: int, d: int, codes: Any, tops: Any, levels: Any, scratch: Any, out: Any,
-    flat_best: Any,
+    flat_out: Any, flat_best: Any,
 ) -> None:  # fmt: skip
     """Write the masks of a run of boxes with one footprint; undecided cells are solved first."""
     count, cells = out.shape[1], codes.shape[1]
-    flat_out = out.reshape(out.shape[0] * count, cells)
     for j in range(batch.size):
         i = batch[j]
         if _write_mask(codes[j], flat_out[i]):
