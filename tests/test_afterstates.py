@@ -287,7 +287,7 @@ def test_after_learning_the_agents_observe_values_of_the_new_critic() -> None:
         observations.append(torch.equal(second, own))
         return actions
 
-    runner.alg.act = spied  # type: ignore[method-assign]
+    runner.alg.act = spied  # type: ignore[method-assign]  # a test watches it
     before = copies(critic)
     runner.train(3)
     assert not same(before, copies(critic))
@@ -321,7 +321,7 @@ def test_a_frozen_network_observes_the_values_of_its_own_critic(
 
     def counted(*arguments: object) -> object:
         turns.append(game.turn)
-        return compute(*arguments)  # type: ignore[arg-type]
+        return compute(*arguments)  # type: ignore[arg-type]  # as they come
 
     monkeypatch.setattr(lookaheads, "afterstates_of", counted)
     runner.train(2)
