@@ -64,6 +64,7 @@ from marl_pack.plan import Plan
 
 ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
 AGENTS = [ORIENTATION, PLACEMENT]
+TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
 RENDER_MODES = ["human", "rgb_array", "ansi"]
 
 
@@ -184,9 +185,7 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
             raise ValueError(f"max_cycles = {max_cycles}: needs at least 1, or None for no limit")
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
-        if "bin" in options:
-            raise TypeError("unexpected option 'bin'; did you mean 'bin_size'?")
-        self._spec = GameSpec(bin=bin_size).with_options(options)
+        self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
         self._unit = max(self._game.size)
@@ -457,4 +456,4 @@ def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
         raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")
 
 
-raw_env.__signature__ = with_options(inspect.signature(raw_env), leave_out=("bin",))
+raw_env.__signature__ = with_options(inspect.signature(raw_env), leave_out=tuple(TAKEN))

@@ -15,6 +15,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset
 from marl_pack.stability.support_area import THRESHOLDS
 
 T = TypeVar("T")
+NOTHING_TAKEN: Mapping[str, str] = MappingProxyType({})
 
 
 def _option(
@@ -201,18 +203,24 @@ class GameSpec:
         names = {option.name for option in fields(GameSpec)}
         return GameSpec(**{key: value for key, value in values.items() if key in names})
 
-    def with_options(self, options: Mapping[str, Any]) -> GameSpec:
+    def with_options(
+        self, options: Mapping[str, Any], taken: Mapping[str, str] = NOTHING_TAKEN
+    ) -> GameSpec:
         """Return the spec with some options changed.
+
+        Args:
+            options: name → value.
+            taken: options that the caller takes by another name → that name.
 
         Raises:
             TypeError: for a name that is no option, with the nearest one.
             ValueError: for an impossible value, or an old name.
         """
-        names = [option.name for option in fields(GameSpec)]
+        names = [taken.get(option.name, option.name) for option in fields(GameSpec)]
         for name in options:
             renamed.refuse_old(name, renamed.OPTIONS, "option")
             if name not in names:
-                near = difflib.get_close_matches(name, names, 1)
+                near = [taken[name]] if name in taken else difflib.get_close_matches(name, names, 1)
                 guess = f"; did you mean {near[0]!r}?" if near else "."
                 raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
         return replace(self, **options) if options else self
