@@ -9,7 +9,7 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "files", "renamed"),
+    ("backend", "checks", "files", "renamed"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
     ("stability", "sapien_check"),
@@ -23,11 +23,12 @@ LAYERS = (
 
 # What the judge and the environment must not need.
 ONLY = {
-    "sapien_check": {"bins", "files", "geometry", "plan", "sapien_check"},
-    "env_aec": {"bins", "game", "geometry", "items", "plan", "render"},
-    "game": {"backend", "bins", "game", "geometry", "items", "plan", "renamed", "stability"},
+    "sapien_check": {"bins", "checks", "files", "geometry", "plan", "sapien_check"},
+    "env_aec": {"bins", "checks", "game", "geometry", "items", "plan", "render"},
+    "game": {"backend", "bins", "checks", "game", "geometry", "items", "plan", "renamed",
+             "stability"},
     "render": {"bins", "geometry", "render"},
-}
+}  # fmt: skip
 
 
 def modules() -> dict[str, Path]:

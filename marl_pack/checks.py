@@ -1,0 +1,61 @@
+"""Check single values: whole numbers and real numbers are what they say, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+LONGEST_TEXT = 60
+"""Number of characters of a value that a message shows."""
+
+
+def whole_number(value: Any, what: str, low: int, high: int | None = None) -> int:
+    """Return a whole number as an int: an int or a NumPy integer, no bool, float or text.
+
+    Args:
+        value: to check.
+        what: names the value, for the message.
+        low: the smallest number allowed.
+        high: the largest number allowed; None if there is none.
+
+    Raises:
+        ValueError: naming the value and what it needs to be.
+    """
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not whole or value < low or (high is not None and value > high):
+        limits = f">= {low}" if high is None else f"from {low} to {high}"
+        raise ValueError(f"{what}: needs a whole number {limits}, not {shown(value)}")
+    return int(value)
+
+
+def real_number(value: Any, what: str) -> float:
+    """Return a finite number as a float: a Python or NumPy number, no bool or text.
+
+    Args:
+        value: to check.
+        what: names the value, for the message.
+
+    Raises:
+        ValueError: naming the value and what it needs to be.
+    """
+    if isinstance(value, Real) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:  # an int beyond float64
+            number = math.inf
+        if math.isfinite(number):
+            return number
+    raise ValueError(f"{what}: needs a finite number, not {shown(value)}")
+
+
+def shown(value: Any) -> str:
+    """Return the text of a value for a message: one line of limited length."""
+    try:
+        text = repr(value.item() if isinstance(value, np.generic) else value)
+    except ValueError:  # an int of more digits than Python writes
+        text = "a number of thousands of digits"
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 3]}..."
