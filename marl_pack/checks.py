@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+
+DECIMAL = frozenset("0123456789+-.eE")
+"""Characters of a number in decimal notation."""
 
 LONGEST_TEXT = 60
 """Number of characters of a value that a message shows."""
@@ -24,7 +28,7 @@ def whole_number(value: Any, what: str, low: int, high: int | None = None) -> in
     Raises:
         ValueError: naming the value and what it needs to be.
     """
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    whole = not isinstance(value, bool) and isinstance(value, Integral)
     if not whole or value < low or (high is not None and value > high):
         limits = f">= {low}" if high is None else f"from {low} to {high}"
         raise ValueError(f"{what}: needs a whole number {limits}, not {shown(value)}")
@@ -41,7 +45,7 @@ def real_number(value: Any, what: str) -> float:
     Raises:
         ValueError: naming the value and what it needs to be.
     """
-    if isinstance(value, Real) and not isinstance(value, bool):
+    if not isinstance(value, bool) and isinstance(value, Real):
         try:
             number = float(value)
         except OverflowError:  # an int beyond float64
@@ -51,11 +55,26 @@ def real_number(value: Any, what: str) -> float:
     raise ValueError(f"{what}: needs a finite number, not {shown(value)}")
 
 
+@lru_cache(maxsize=1 << 14)  # the cells of a table repeat
+def number_in(text: str) -> float:
+    """Return the number that a text is in decimal notation, an int if it has only digits.
+
+    Raises:
+        ValueError: for other text, such as ``1_0``, digits of other scripts, ``nan`` or spaces.
+    """
+    try:
+        if DECIMAL.issuperset(text):  # so float() reads plain decimals alone
+            return int(text) if text.lstrip("+-").isdigit() and len(text) < 20 else float(text)
+    except ValueError:
+        pass
+    raise ValueError(f"{shown(text)} is not a number")
+
+
 def shown(value: Any) -> str:
     """Return the text of a value for a message: one line of limited length."""
     try:
         text = repr(value.item() if isinstance(value, np.generic) else value)
-    except ValueError:  # an int of more digits than Python writes
-        text = "a number of thousands of digits"
+    except (ValueError, RecursionError):  # an int of more digits than Python writes
+        text = f"a {type(value).__name__} that is too long to show"
     text = " ".join(text.split())
     return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 3]}..."

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "checks", "files", "renamed"),
+    ("backend", "checks", "files", "inputs", "renamed"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
     ("stability", "sapien_check"),

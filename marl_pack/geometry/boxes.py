@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
 from functools import cache
-from numbers import Real
 
 import torch
 from torch import Tensor
+
+from marl_pack.checks import real_number, shown
 
 Size = tuple[int, int, int]
 """A bin's sides (W, D, H) in cells."""
@@ -32,25 +31,21 @@ MAX_SIDE = 32767
 """Width and depth of the largest bin in cells."""
 
 
-def _is_number(value: object) -> bool:
-    """Return whether ``value`` is a finite real number, booleans excluded."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return False
-    return math.isfinite(float(value))
-
-
 def check_size(size: Size) -> Size:
     """Return a bin's ``size`` as three ints.
 
     Raises:
         ValueError: unless it is three whole numbers from 1 to the largest allowed.
     """
-    sides = tuple(size) if isinstance(size, Iterable) else ()
-    if len(sides) != 3 or any(not _is_number(s) or int(s) != s or s < 1 for s in sides):
-        raise ValueError(f"bin size {size!r}: needs three whole numbers of cells ≥ 1, W D H")
+    try:
+        sides = [real_number(side, "side") for side in size]
+    except (TypeError, ValueError):
+        sides = []
+    if len(sides) != 3 or any(not side.is_integer() or side < 1 for side in sides):
+        raise ValueError(f"bin size {shown(size)}: needs three whole numbers of cells ≥ 1, W D H")
     if sides[2] > MAX_HEIGHT or max(sides) > MAX_SIDE:
         raise ValueError(
-            f"bin size {size!r}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger cells"
+            f"bin size {shown(size)}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger cells"
         )
     return int(sides[0]), int(sides[1]), int(sides[2])
 

@@ -9,6 +9,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from marl_pack.checks import shown, whole_number
 from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
 from marl_pack.items.random_numbers import draw, episode_keys
@@ -20,10 +21,14 @@ def check_sides(sides: tuple[int, int]) -> tuple[int, int]:
     Raises:
         ValueError: unless they are whole numbers with 1 ≤ shortest ≤ longest.
     """
-    pair = tuple(sides)
-    if len(pair) != 2 or any(int(s) != s for s in pair) or not 1 <= pair[0] <= pair[1]:
-        raise ValueError(f"sides {sides!r}: need two whole numbers, 1 ≤ shortest ≤ longest")
-    return int(pair[0]), int(pair[1])
+    try:
+        low, high = sides
+        low = whole_number(low, "shortest", 1)
+        return low, whole_number(high, "longest", low)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"sides {shown(sides)}: need two whole numbers, 1 ≤ shortest ≤ longest"
+        ) from None
 
 
 @njit(cache=True)

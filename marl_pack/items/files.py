@@ -6,18 +6,18 @@ The readers bring what a file contains into the arguments of
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from marl_pack.checks import number_in, shown
+from marl_pack.inputs import read_arrays, read_json, read_lines
 from marl_pack.items.items import ATTRIBUTES, KEYS
 from marl_pack.items.names import check_names
-from marl_pack.items.sequences import split_sequences
+from marl_pack.items.sequences import Ragged, split_sequences
 
 SIDES = ("w", "d", "h")
 COLUMNS = (*SIDES, *(attribute.column for attribute in ATTRIBUTES), "sequence")
@@ -51,11 +51,7 @@ def check_fields(fields: Mapping[str, Any], source: str, what: str = "key") -> N
 
 def _read_npz(path: Path) -> dict[str, Any]:
     """Return the arrays of an archive."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            fields = {key: archive[key] for key in archive.files}
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable .npz archive ({error})") from error
+    fields: dict[str, Any] = dict(read_arrays(path))
     check_fields(fields, str(path), "array")
     if "bin" in fields:
         fields["bin"] = fields["bin"].ravel().tolist()
@@ -64,12 +60,12 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the keys of an object, or the items that a list gives."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
+    content = read_json(path)
     fields = content if isinstance(content, dict) else {"items": content}
     check_fields(fields, str(path))
+    for key, value in fields.items():
+        if value is None:
+            raise ValueError(f"{path}: key {key!r} is null; needs values, or to be left out")
     sequences, _ = split_sequences(fields["items"], str(path))
     if all(isinstance(sequence, list) for sequence in sequences):  # none is padded with zeros
         fields.setdefault("lengths", [len(sequence) for sequence in sequences])
@@ -79,52 +75,63 @@ def _read_json(path: Path) -> dict[str, Any]:
 def _read_csv(path: Path) -> dict[str, Any]:
     """Return the columns of a table with one item a row, split into sequences."""
     cells = _read_table(path)
-    fields = {"items": np.stack([np.array(cells[name], np.float64) for name in SIDES], 1)}
-    fields |= {a.key: np.array(cells[a.column]) for a in ATTRIBUTES if a.column in cells}
-    count = len(fields["items"])
-    order, ends = np.arange(count), np.array([count])
-    if "sequence" in cells:  # sequences in the order of their first rows
-        ranks: dict[str, int] = {}
-        rank = np.array([ranks.setdefault(name, len(ranks)) for name in cells["sequence"]])
-        order, ends = rank.argsort(kind="stable"), np.bincount(rank).cumsum()
-    split = {key: np.split(values[order], ends[:-1]) for key, values in fields.items()}
-    return {**split, "lengths": np.diff(ends, prepend=0)}
+    sides = np.column_stack([_numbers(path, cells, name) for name in SIDES])
+    fields = {"items": sides} | {
+        attribute.key: attribute.of_cells(cells[attribute.column])
+        for attribute in ATTRIBUTES
+        if attribute.column in cells
+    }
+    if "sequence" not in cells:
+        return fields | {"lengths": [len(sides)]}
+    ranks: dict[str, int] = {}  # sequences in the order of their first rows
+    rank = np.array([ranks.setdefault(name, len(ranks)) for name in cells["sequence"]])
+    order, counts = rank.argsort(kind="stable"), np.bincount(rank)
+    return {key: Ragged(_selected(values, order), counts) for key, values in fields.items()}
+
+
+def _selected(values: list[Any] | NDArray[Any], order: NDArray[np.int64]) -> Any:
+    """Return the values in another order."""
+    if isinstance(values, np.ndarray):
+        return values[order]
+    return [values[i] for i in order.tolist()]
+
+
+def _numbers(path: Path, cells: dict[str, list[str]], name: str) -> NDArray[np.float64]:
+    """Return a column of numbers; refuse the first row that has none there."""
+    numbers: list[float] = []
+    try:
+        for text in cells[name]:
+            numbers.append(number_in(text))
+    except ValueError as error:
+        row = [cells[side][len(numbers)] for side in SIDES]
+        raise ValueError(
+            f"{path}: row {len(numbers)} is {shown(row)}: {name} {error}; needs whole cells ≥ 1"
+        ) from None
+    return np.array(numbers, np.float64)
 
 
 def _read_table(path: Path) -> dict[str, list[str]]:
-    """Return the texts of each column by its name; those of w, d and h are numbers.
+    """Return the texts of each column by its name.
 
     Raises:
         ValueError: for a column that is missing, unknown or given twice, or a row with too few
-            or too many values or a side that is no number, which is named.
+            or too many values, which is named.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not readable as UTF-8 text ({error})") from None
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    columns = [name.strip() for name in next(reader, [])]
+    lines = read_lines(path, trim=True)
+    columns = [name.strip() for name in next(lines, (0, []))[1]]
     while columns and not columns[-1]:  # spreadsheets write a comma after the last column
         columns.pop()
     check_names(columns, COLUMNS, SIDES, str(path), "column")
     if len(set(columns)) < len(columns):
         raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
-    places = [columns.index(name) for name in SIDES]
     cells: list[str] = []  # row by row in one list: a list for each row is three times slower
-    for row in filter(None, reader):
+    for line, row in lines:
         if len(row) > len(columns) and not any(row[len(columns) :]):
             del row[len(columns) :]
-        try:
-            for place in places:
-                float(row[place])
-            complete = len(row) == len(columns) and "" not in row
-        except (ValueError, IndexError):
-            complete = False
-        if not complete:
-            number = len(cells) // len(columns)
+        if len(row) != len(columns) or "" in row:
             raise ValueError(
-                f"{path}: row {number} (line {reader.line_num}) is {row}: needs a value for "
-                f"each of {', '.join(columns)}, numbers for the sides"
+                f"{path}: row {len(cells) // len(columns)} (line {line}) is {shown(row)}: needs a "
+                f"value for each of {', '.join(columns)}"
             )
         cells += row
     if not cells:

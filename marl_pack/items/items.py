@@ -7,8 +7,9 @@ row there and the code that uses it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from marl_pack.checks import number_in, real_number
 from marl_pack.geometry import ORIENTATIONS
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
 """Numbers of the six orientations, :data:`marl_pack.geometry.ORIENTATIONS`."""
 UPRIGHT = (0, 1)
 """Orientations in which the item's own height stays vertical: this side up."""
+
+LONGEST_ID = 200
+"""Characters of the longest id."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +99,9 @@ class Attribute:
         shape: shape of one item's value.
         dtype: NumPy type of the values.
         kinds: kinds of NumPy arrays that are converted whole; other values are parsed one by one.
-        parse: from one value (text of a CSV cell, JSON value, array element) to the value;
-            raises ValueError, TypeError or KeyError.
+        of_text: from the text of a CSV cell to a value as JSON has it; raises ValueError.
+        parse: from one value (of JSON, a mapping or an array) to the value; raises ValueError,
+            TypeError or KeyError.
         check: which of the values [R, *shape] are valid, bool [R].
     """
 
@@ -105,8 +111,19 @@ class Attribute:
     shape: tuple[int, ...]
     dtype: type
     kinds: str
+    of_text: Callable[[str], Any]
     parse: Callable[[Any], Any]
     check: Callable[[NDArray[Any]], NDArray[np.bool_]]
+
+    def of_cells(self, cells: Sequence[str]) -> list[Any]:
+        """Return the values of CSV cells as JSON has them; texts that are none stay texts."""
+        values: list[Any] = []
+        for cell in cells:
+            try:
+                values.append(self.of_text(cell))
+            except ValueError:
+                values.append(cell)
+        return values
 
     def read(self, values: Sequence[Any] | NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return the values of R items, [R, *shape], and which of them are invalid, bool [R]."""
@@ -121,19 +138,22 @@ class Attribute:
         return array, invalid | ~self.check(array)
 
     def _convert(self, values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
-        """Return the values converted as one array, or None if each needs to be parsed.
-
-        A list that becomes an array of texts may have had numbers in it, so it is parsed.
-        """
+        """Return the values converted as one array, or None if each needs to be parsed."""
         try:
-            array = np.asarray(values)
-            if array.dtype.kind == "U" and array is not values:
-                return None
-            if array.dtype.kind in self.kinds and array.shape == (len(values), *self.shape):
-                return array.astype(self.dtype)
-        except (ValueError, OverflowError):
+            if isinstance(values, np.ndarray) or only_numbers(values):
+                array = np.asarray(values)
+                if array.dtype.kind in self.kinds and array.shape == (len(values), *self.shape):
+                    return array.astype(self.dtype)
+        except OverflowError:
             pass
         return None
+
+
+def only_numbers(values: Iterable[Any]) -> bool:
+    """Return whether all the values are numbers, or all are truth values."""
+    types = set(map(type, values))
+    truths = types & {bool, np.bool_}
+    return truths == types or (not truths and all(issubclass(t, Real) for t in types))
 
 
 TRUTH = {"true": True, "yes": True, "1": True, 1: True}
@@ -145,53 +165,69 @@ def _truth(value: Any) -> bool:
     return TRUTH[value.lower() if isinstance(value, str) else value]
 
 
-def _number(value: Any) -> float:
-    """Return the number that a text or a number stands for."""
-    if isinstance(value, bool | np.bool_):
-        raise TypeError(value)
-    return float(value)
+def _weight(value: Any) -> float:
+    """Return a weight, positive or not."""
+    return real_number(value, "weight")
 
 
 def _whole(value: Any) -> int:
-    """Return the whole number that a text or a number stands for."""
-    number = _number(value)
-    if number != int(number):
+    """Return a whole number, which may be written as a float."""
+    if not isinstance(value, bool) and isinstance(value, Integral):
+        return int(value)
+    number = real_number(value, "value")
+    if not number.is_integer():
         raise ValueError(value)
     return int(number)
 
 
+def _orientations_in(text: str) -> list[int]:
+    """Return the numbers of orientations that a text lists."""
+    return [tuple("012345").index(number) for number in text.replace(",", " ").split()]
+
+
 def _orientation_mask(value: Any) -> NDArray[np.bool_]:
-    """Return bool [6] from a list of numbers 0 … 5, or a text of them."""
-    numbers = value.replace(",", " ").split() if isinstance(value, str) else list(value)
-    if len({_whole(n) for n in numbers}) < len(numbers):  # such as flags 0 and 1
+    """Return bool [6] from a list of numbers 0 … 5, or of six truth values."""
+    if len(value) == len(ALL_ORIENTATIONS) and all(isinstance(flag, bool) for flag in value):
+        return np.array(value)
+    numbers = [ALL_ORIENTATIONS.index(_whole(number)) for number in value]
+    if len(set(numbers)) < len(numbers):  # such as flags 0 and 1
         raise ValueError(value)
-    return np.isin(ALL_ORIENTATIONS, [ALL_ORIENTATIONS.index(_whole(n)) for n in numbers])
+    return np.isin(ALL_ORIENTATIONS, numbers)
 
 
 def _id(value: Any) -> str | int:
     """Return an id that is a text or a whole number."""
-    return value if isinstance(value, str) else _whole(value)
+    number = value if isinstance(value, str) else _whole(value)
+    if not isinstance(number, str) and abs(number) >= 10**LONGEST_ID:
+        raise ValueError(value)
+    return number
+
+
+def _short(ids: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which texts among ids have an allowed length, bool [R]."""
+    return np.array([not isinstance(i, str) or 0 < len(i) <= LONGEST_ID for i in ids], bool)
 
 
 ATTRIBUTES = (
     Attribute(
-        "weight", "weights", "a positive number", (), np.float64, "iufU", _number,
+        "weight", "weights", "a positive number", (), np.float64, "iuf", number_in, _weight,
         lambda values: np.array(np.isfinite(values) & (values > 0), bool),
     ),
     Attribute(
-        "upright", "upright", "true or false (1 or 0, yes or no)", (), np.bool_, "b", _truth,
+        "upright", "upright", "true or false (1 or 0, yes or no)", (), np.bool_, "b", str, _truth,
         lambda values: np.ones(len(values), bool),
     ),
     Attribute(
         "orientations", "orientations", "one or more of the numbers 0 … 5, each once", (6,),
-        np.bool_, "b", _orientation_mask, lambda values: np.array(values.any(1), bool),
+        np.bool_, "b", _orientations_in, _orientation_mask,
+        lambda values: np.array(values.any(1), bool),
     ),
     Attribute(
-        "id", "ids", "a text or a whole number", (), np.object_, "iuU", _id,
-        lambda values: np.array(values != "", bool),
+        "id", "ids", f"a text or a whole number of at most {LONGEST_ID} characters", (), np.object_,
+        "iuU", str, _id, _short,
     ),
     Attribute(
-        "quantity", "quantity", "a whole number ≥ 1", (), np.int64, "iuU", _whole,
+        "quantity", "quantity", "a whole number ≥ 1", (), np.int64, "iu", number_in, _whole,
         lambda values: np.array(values >= 1, bool),
     ),
 )  # fmt: skip

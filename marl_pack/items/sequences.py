@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, compress
 from numbers import Real
 from typing import Any
 
@@ -13,8 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from marl_pack.backend import Backend
+from marl_pack.checks import shown
 from marl_pack.geometry import ORIENTATIONS, Size
-from marl_pack.items.items import ALL_ORIENTATIONS, ATTRIBUTES, KEYS, UPRIGHT, Attribute, Items
+from marl_pack.items.items import (
+    ALL_ORIENTATIONS,
+    ATTRIBUTES,
+    KEYS,
+    UPRIGHT,
+    Attribute,
+    Items,
+    only_numbers,
+)
 from marl_pack.items.names import check_names
 
 # --- the stream -----------------------------------------------------------------------------------
@@ -24,34 +35,52 @@ from marl_pack.items.names import check_names
 class Sequences:
     """The stream of given sequences: episode k is sequence k modulo their number."""
 
-    items: Items  # [S, L]          zeros after each sequence's end
-    id_names: tuple[str, ...] | None = None  # texts that ``items.ids`` index
+    rows: Items  # [R]     the items of all sequences, one after the other
+    spans: (
+        Tensor  # int64 [S, 2]  number of each sequence's first row, and of the row after its last
+    )
+    id_names: tuple[str, ...] | None = None  # texts that the ids index
+
+    @property
+    def items(self) -> Items:
+        """The items of each sequence [S, L], with zeros after its end."""
+        numbers = torch.arange(self.episodes, device=self.spans.device)
+        places = numbers.repeat_interleave(self.spans.diff().squeeze(1)), self.steps()
+        shape = self.episodes, self.longest
+        return self.rows.map(
+            lambda values: values.new_zeros(*shape, *values.shape[1:]).index_put(places, values)
+        )
+
+    def steps(self) -> Tensor:
+        """Return the place of each row in its sequence, int64 [R]."""
+        first, end = self.spans.unbind(1)
+        rows = torch.arange(len(self.rows.sides), device=first.device)
+        return rows - first.repeat_interleave(end - first)
 
     @property
     def smallest(self) -> int:
         """Volume of the smallest item, in cells."""
-        return int(self.items.sides[self.items.present].long().prod(1).min())
+        return int(self.rows.sides.long().prod(1).min())
 
     @property
     def sides(self) -> tuple[int, int]:
         """Shortest and longest side of any item, in cells."""
-        sides = self.items.sides
-        return int(sides[sides > 0].min()), int(sides.max())
+        return int(self.rows.sides.min()), int(self.rows.sides.max())
 
     @property
     def orientation_sets(self) -> dict[tuple[int, ...], float]:
         """Sets of orientations that items may take, with the share of items that have each."""
-        return self.items.orientation_sets()
+        return self.rows.orientation_sets()
 
     @property
     def episodes(self) -> int:
         """Number of sequences S."""
-        return len(self.items.sides)
+        return len(self.spans)
 
     @property
     def longest(self) -> int:
         """Length L of the longest sequence."""
-        return self.items.sides.shape[1]
+        return int(self.spans.diff().max())
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """Return the indices of the sequences, int64 [K]; the seed has no effect."""
@@ -63,58 +92,58 @@ class Sequences:
 
     def item(self, state: Tensor, t: Tensor) -> Items:
         """Return the items [N] at step ``t`` of each sequence; zeros after its end."""
-        last = self.longest - 1
-        past, step = t > last, t.clamp(max=last)
+        first, end = self.spans[state].unbind(1)
+        row = first + t
+        past = row >= end
         beyond = past[:, None]
-        return self.items.map(
-            lambda table: table[state, step].masked_fill_(past if table.ndim == 2 else beyond, 0)
+        row = row.masked_fill(past, 0)
+        return self.rows.map(
+            lambda table: table[row].masked_fill_(past if table.ndim == 1 else beyond, 0)
         ).numbered(t)
 
     def to(self, device: torch.device | str, backend: Backend | None = None) -> Sequences:
         """Return the same sequences on ``device``; every backend looks items up alike."""
-        return replace(self, items=self.items.to(device))
+        return replace(self, rows=self.rows.to(device), spans=self.spans.to(device))
 
 
 # --- the checks -----------------------------------------------------------------------------------
 
 
+MOST_ITEMS = 10_000_000
+"""The most items that sequences may have, all together."""
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """Values of sequences of unequal length, one sequence after the other."""
+
+    values: list[Any] | NDArray[Any]  # [R, …]
+    counts: NDArray[np.int64]  # [S]  number of values in each sequence
+
+
 @dataclass(frozen=True)
 class Rows:
-    """The rows of all sequences, one after the other, with their numbers for error messages."""
+    """The rows of all sequences, one after the other."""
 
-    sides: NDArray[np.float64]  # [R, 3]
-    sequence: NDArray[np.int64]  # [R]   number of the sequence
-    number: NDArray[np.int64]  # [R]     number of the row in its sequence
+    sides: NDArray[Any]  # [R, 3]
+    counts: NDArray[np.int64]  # [S]  number of rows in each sequence
     source: str
     single: bool  # whether the items were given as one sequence [L, 3]
-
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> Rows:
-        """Return the chosen rows."""
-        return replace(
-            self,
-            sides=self.sides[chosen],
-            sequence=self.sequence[chosen],
-            number=self.number[chosen],
-        )
-
-    @property
-    def counts(self) -> NDArray[np.int64]:
-        """Number of rows in each sequence, int64 [S]."""
-        return np.bincount(self.sequence)
 
     def refuse(self, wrong: NDArray[np.bool_], why: str) -> None:
         """Raise ValueError with the first row where ``wrong`` is true, if there is one."""
         if wrong.any():
             i = int(wrong.argmax())
-            place = f"row {self.number[i]}"
-            if self.sequence[-1] > 0:
-                place = f"sequence {self.sequence[i]}, {place}"
-            sides = self.sides[i].tolist()
-            raise ValueError(f"{self.source}: {place} is {sides}: {why}")
+            ends = self.counts.cumsum()
+            sequence = int(ends.searchsorted(i, side="right"))
+            place = f"row {i - ends[sequence] + self.counts[sequence]}"
+            if len(ends) > 1:
+                place = f"sequence {sequence}, {place}"
+            raise ValueError(f"{self.source}: {place} is {self.sides[i].tolist()}: {why}")
 
 
 def check_items(
-    items: ArrayLike,
+    items: ArrayLike | Ragged,
     size: Size,
     *,
     lengths: ArrayLike | None = None,
@@ -139,14 +168,19 @@ def check_items(
     """
     check_names(attributes, KEYS, (), source, "attribute")
     rows = _read_rows(items, source)
-    inside = _before_ends(rows, lengths)
-    _check_sides(rows, inside)
+    if lengths is None and isinstance(items, Ragged):
+        lengths = rows.counts
+    ends = _ends(rows, lengths)
+    inside = _before(ends, rows.counts)
+    rows.refuse(~inside & rows.sides.any(1), "after the end of its sequence; needs zeros there")
+    given = {a: _flatten(attributes[a.key], rows) for a in ATTRIBUTES
+             if attributes.get(a.key) is not None}  # fmt: skip
+    rows = replace(rows, sides=rows.sides[inside].astype(np.float64), counts=ends)
+    _check_sides(rows)
     values = {
-        attribute.key: _read_attribute(attribute, attributes[attribute.key], rows, inside)
-        for attribute in ATTRIBUTES
-        if attributes.get(attribute.key) is not None
+        attribute.key: _read_attribute(attribute, column, inside, rows)
+        for attribute, column in given.items()
     }
-    rows = rows[inside]
     quantity, upright = values.pop("quantity", None), values.pop("upright", None)
     allowed = _allowed(values.pop("orientations", None), upright, rows)
     _check_fit(rows, allowed, size)
@@ -157,15 +191,19 @@ def check_items(
         columns["ids"], id_names = number_ids(columns["ids"])
     if not allowed.all():
         columns["orientations"] = allowed
-    sequence = rows.sequence
+    total = len(rows.sides) if quantity is None else quantity.sum(dtype=np.float64)
+    if total > MOST_ITEMS:
+        raise ValueError(f"{source}: {total:.0f} items: needs at most {MOST_ITEMS}")
     if quantity is not None:
-        sequence = sequence.repeat(quantity)
         columns = {name: column.repeat(quantity, axis=0) for name, column in columns.items()}
-    tensors = {name: torch.from_numpy(_padded(c, sequence)) for name, c in columns.items()}
-    return Sequences(Items(**tensors), id_names)
+        ends = np.add.reduceat(quantity, ends.cumsum() - ends)
+    last = ends.cumsum()
+    spans = torch.from_numpy(np.stack((last - ends, last), 1))
+    tensors = {name: torch.from_numpy(column) for name, column in columns.items()}
+    return Sequences(Items(**tensors), spans, id_names)
 
 
-def split_sequences(items: Any, source: str) -> tuple[list[Any], bool]:
+def split_sequences(items: Any, source: str) -> tuple[Sequence[Any] | NDArray[Any], bool]:
     """Return the S sequences of rows, and whether they were given as one [L, 3].
 
     Raises:
@@ -175,7 +213,7 @@ def split_sequences(items: Any, source: str) -> tuple[list[Any], bool]:
         array = np.asarray(items)
         if array.ndim not in (2, 3) or array.shape[-1] != 3 or 0 in array.shape:
             raise ValueError(f"{source}: shape {array.shape}, needs [L, 3] or [S, L, 3] (w, d, h)")
-        return list(array if array.ndim == 3 else array[None]), array.ndim == 2
+        return array if array.ndim == 3 else array[None], array.ndim == 2
     if not _is_list(items) or not len(items):
         raise ValueError(f"{source}: needs a list of rows [w, d, h], or of such lists")
     first = items[0]
@@ -190,34 +228,48 @@ def _is_list(values: object) -> bool:
 
 def _read_rows(items: Any, source: str) -> Rows:
     """Return the rows of all sequences, with zeros after their ends if they are given."""
+    if isinstance(items, Ragged):
+        return Rows(np.asarray(items.values), items.counts, source, single=False)
     sequences, single = split_sequences(items, source)
+    if isinstance(sequences, np.ndarray) and sequences.dtype.kind in "iuf":
+        count, length, _ = sequences.shape
+        return Rows(sequences.reshape(-1, 3), np.full(count, length), source, single)
+    if all(isinstance(sequence, list) and sequence for sequence in sequences):
+        sides = _numbers(list(chain.from_iterable(sequences)))
+        if sides is not None:
+            return Rows(sides, np.array(list(map(len, sequences))), source, single)
     blocks = []
     for k, sequence in enumerate(sequences):
         name = f"{source}: " if len(sequences) == 1 else f"{source}: sequence {k}, "
         blocks.append(_read_block(sequence, name))
-    counts = np.array([len(block) for block in blocks])
-    number = np.arange(counts.sum()) - np.repeat(counts.cumsum() - counts, counts)
-    indices = np.repeat(np.arange(len(counts)), counts)
-    return Rows(np.concatenate(blocks), indices, number, source, single)
+    return Rows(np.concatenate(blocks), np.array(list(map(len, blocks))), source, single)
+
+
+def _numbers(rows: Any) -> NDArray[Any] | None:
+    """Return rows of three numbers as an array [L, 3]; None if they are anything else."""
+    if not isinstance(rows, np.ndarray):
+        if not (all(map(_is_list, rows)) and only_numbers(chain.from_iterable(rows))):
+            return None
+        try:
+            rows = np.asarray(rows)
+        except ValueError:  # rows of different lengths
+            return None
+    return rows if rows.shape[1:] == (3,) and rows.dtype.kind in "iuf" else None
 
 
 def _read_block(rows: Any, name: str) -> NDArray[np.float64]:
     """Return the rows of one sequence, float64 [L, 3]; ``name`` begins an error message."""
     if not _is_list(rows):
-        raise ValueError(f"{name}{rows!r} is not a list of rows w, d, h")
+        raise ValueError(f"{name}{shown(rows)} is not a list of rows w, d, h")
     if not len(rows):
         raise ValueError(f"{name}has no items")
-    try:
-        array = np.asarray(rows)
-        numeric = array.shape == (len(rows), 3) and array.dtype.kind in "iuf"
-        if numeric and (array is rows or bool not in set(map(type, chain.from_iterable(rows)))):
-            return array.astype(np.float64)
-    except ValueError:
-        pass
+    sides = _numbers(rows)
+    if sides is not None:
+        return sides
     for number, row in enumerate(rows):
         if not _is_row(row):
-            raise ValueError(f"{name}row {number} is {row!r}: needs three numbers w, d, h")
-    return np.array(rows, np.float64)
+            raise ValueError(f"{name}row {number} is {shown(row)}: needs three numbers w, d, h")
+    return np.array([[_float(value) for value in row] for row in rows])
 
 
 def _is_row(row: Any) -> bool:
@@ -227,43 +279,70 @@ def _is_row(row: Any) -> bool:
     return all(isinstance(value, Real) and not isinstance(value, bool) for value in row)
 
 
-def _before_ends(rows: Rows, lengths: ArrayLike | None) -> NDArray[np.bool_]:
-    """Return which rows stand before the end of their sequence, bool [R]."""
-    ends, count = rows.counts, len(rows.counts)
-    if lengths is None:
-        blank = (rows.sides == 0).all(1)
-        np.minimum.at(ends, rows.sequence[blank], rows.number[blank])
-    else:
-        numbers = np.asarray(lengths)
-        whole = numbers.shape == (count,) and numbers.dtype.kind in "iu"
-        if not whole or not ((numbers >= 1) & (numbers <= ends)).all():
+def _float(number: Real) -> float:
+    """Return a number as a float, infinite if it is too large."""
+    try:
+        return float(number)
+    except OverflowError:
+        return math.inf
+
+
+def _ends(rows: Rows, lengths: Any) -> NDArray[np.int64]:
+    """Return the number of rows before the end of each sequence, int64 [S]."""
+    counts = rows.counts
+    if lengths is not None:
+        plain = isinstance(lengths, np.ndarray) or (_is_list(lengths) and only_numbers(lengths))
+        numbers = np.asarray(lengths) if plain else np.zeros(0)
+        whole = numbers.shape == counts.shape and numbers.dtype.kind in "iu"
+        if not whole or not ((numbers >= 1) & (numbers <= counts)).all():
             raise ValueError(
-                f"{rows.source}: lengths need {count} whole numbers in 1 … {ends.max()}"
+                f"{rows.source}: lengths need {len(counts)} whole numbers in 1 … {counts.max()}"
             )
-        ends = numbers.astype(np.int64)
+        return numbers.astype(np.int64)
+    blank = ~rows.sides.any(1)
+    if (counts == counts[0]).all():  # a grid, which may be mostly blank: spare its memory
+        grid = blank.reshape(-1, counts[0])
+        ends = np.where(grid.any(1), grid.argmax(1), counts)
+    else:
+        last = counts.cumsum()
+        blanks = np.append(np.flatnonzero(blank), last[-1])
+        first = last - counts
+        ends = np.minimum(blanks[blanks.searchsorted(first)] - first, counts)
     if not ends.all():
         raise ValueError(f"{rows.source}: sequence {ends.argmin()} has no items")
-    return rows.number < ends[rows.sequence]
+    return ends
 
 
-def _check_sides(rows: Rows, inside: NDArray[np.bool_]) -> None:
-    """Refuse sides that are no whole numbers of cells, and rows after the end of a sequence."""
-    sides = rows.sides
+def _before(ends: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of the rows of sequences stand before the ends, bool [R]."""
+    if (counts == counts[0]).all():
+        return (np.arange(counts[0]) < ends[:, None]).ravel()
+    number = np.arange(counts.sum()) - (counts.cumsum() - counts).repeat(counts)
+    return number < ends.repeat(counts)
+
+
+def _check_sides(rows: Rows) -> None:
+    """Refuse sides that are no whole numbers of cells."""
     problems = {
-        "not a number": ~np.isfinite(sides),
-        "a fraction of a cell": sides != np.floor(sides),
-        "zero or negative": sides < 1,
+        "not a number": ~np.isfinite(rows.sides),
+        "a fraction of a cell": rows.sides != np.floor(rows.sides),
+        "zero or negative": rows.sides < 1,
     }
     for problem, wrong in problems.items():
-        rows.refuse(inside & wrong.any(1), f"{problem}; needs whole cells ≥ 1")
-    rows.refuse(~inside & (sides != 0).any(1), "after the end of its sequence; needs zeros there")
+        rows.refuse(wrong.any(1), f"{problem}; needs whole cells ≥ 1")
 
 
 def _read_attribute(
-    attribute: Attribute, values: Any, rows: Rows, inside: NDArray[np.bool_]
+    attribute: Attribute, column: Any, inside: NDArray[np.bool_], rows: Rows
 ) -> NDArray[Any]:
-    """Return an attribute of the items ``inside``, [R', *shape]."""
-    column = _flatten(values, rows)
+    """Return an attribute of the items [R', *shape].
+
+    Args:
+        attribute: which one.
+        column: its values before and after the ends of sequences [R]; None: of another number.
+        inside: which of them stand before the ends, bool [R].
+        rows: those before the ends, for messages.
+    """
     if column is None:
         raise ValueError(
             f"{rows.source}: {attribute.key!r} needs one value an item, shaped or listed as items"
@@ -271,11 +350,10 @@ def _read_attribute(
     if isinstance(column, np.ndarray):
         column = column[inside]
     else:
-        column = [value for value, wanted in zip(column, inside, strict=True) if wanted]
+        column = list(compress(column, inside.tolist()))
     array, wrong = attribute.read(column)
-    value = column[int(wrong.argmax())]
-    text = repr(value.item() if isinstance(value, np.generic) else value)
-    rows[inside].refuse(wrong, f"{attribute.column} {text}; needs {attribute.needs}")
+    text = shown(column[int(wrong.argmax())])
+    rows.refuse(wrong, f"{attribute.column} {text}; needs {attribute.needs}")
     return array
 
 
@@ -284,8 +362,12 @@ def _flatten(values: Any, rows: Rows) -> list[Any] | NDArray[Any] | None:
 
     A single sequence may have them as [L] or [1, L].
     """
+    if isinstance(values, Ragged):
+        return values.values
     values = np.asarray(values) if hasattr(values, "__array__") else values
     counts = rows.counts.tolist()
+    if isinstance(values, np.ndarray) and values.shape[:2] == (len(counts), counts[0]) != (1, 1):
+        return values.reshape(-1, *values.shape[2:]) if len(set(counts)) == 1 else None
     options = ([values], values) if rows.single else (values, [values])
     for nested in options if len(counts) == 1 else (values,):
         if _is_list(nested) and [len(v) if _is_list(v) else -1 for v in nested] == counts:
@@ -300,7 +382,7 @@ def _allowed(
 ) -> NDArray[np.bool_]:
     """Return the orientations that the items may take by both attributes, bool [R, 6]."""
     stays_upright = np.isin(ALL_ORIENTATIONS, UPRIGHT)
-    everything = np.ones((len(rows.sequence), len(ALL_ORIENTATIONS)), bool)
+    everything = np.ones((len(rows.sides), len(ALL_ORIENTATIONS)), bool)
     if upright is None:
         return everything if orientations is None else orientations
     if orientations is not None:
@@ -327,21 +409,12 @@ def number_ids(ids: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[str, ...] | 
         ids: texts and whole numbers [R]. Texts such as "007" are not numbers, and negative numbers
             are texts: a label below 0 says that an id is unknown.
     """
-    texts = ids.astype(str)
-    try:
-        numbers = ids.astype(np.int64)
-        if (numbers >= 0).all() and (numbers.astype(str) == texts).all():
-            return numbers, None
-    except (ValueError, OverflowError):
-        pass
-    names, indices = np.unique(texts, return_inverse=True)
-    return indices.astype(np.int64), tuple(names.tolist())
-
-
-def _padded(values: NDArray[Any], sequence: NDArray[np.int64]) -> NDArray[Any]:
-    """Return values [R, …] of the sequences [R] as [S, L, …], with zeros after their ends."""
-    counts = np.bincount(sequence)
-    place = np.arange(len(sequence)) - np.repeat(counts.cumsum() - counts, counts)
-    table = np.zeros((len(counts), counts.max(), *values.shape[1:]), values.dtype)
-    table[sequence, place] = values
-    return table
+    texts = [str(name) for name in ids]
+    whole = [name.isascii() and name.isdigit() and len(name) < 20 for name in texts]
+    if all(whole):
+        numbers = np.array(list(map(int, texts)), np.uint64)
+        if numbers.max() < 2**63 and list(map(str, numbers.tolist())) == texts:
+            return numbers.astype(np.int64), None
+    names = sorted(set(texts))
+    index = {name: i for i, name in enumerate(names)}
+    return np.array([index[name] for name in texts]), tuple(names)

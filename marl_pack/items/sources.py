@@ -9,6 +9,7 @@ from typing import Any, cast
 import torch
 from numpy.typing import ArrayLike
 
+from marl_pack.checks import whole_number
 from marl_pack.geometry import Size, check_size
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import check_fields, read_fields
@@ -24,6 +25,8 @@ DEFAULT_SIDES = (2, 5)
 
 MEMBERS = tuple(name for name in vars(Stream) if not name.startswith("_"))
 """Names of the members of a stream."""
+METHODS = tuple(name for name in MEMBERS if callable(getattr(Stream, name)))
+"""Those that are methods."""
 
 
 def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
@@ -88,7 +91,7 @@ def make_stream(
 
     Raises:
         ValueError: if an item fits into the bin in none of its orientations, the name is unknown,
-            or an object lacks a member of a stream.
+            or an object lacks a member of a stream or has an impossible one.
     """
     size = check_size(size)
     if isinstance(items, str) and items in GENERATED:
@@ -105,13 +108,39 @@ def make_stream(
         return _from_fields(items, size, "items")[0]
     if isinstance(items, list | tuple) or hasattr(items, "__array__"):
         return check_items(cast(ArrayLike, items), size)
-    missing = [name for name in MEMBERS if not hasattr(items, name)]
+    return check_stream(items)
+
+
+def check_stream(stream: Any) -> Stream:
+    """Return an object that has the members of a stream, with values that a game can use.
+
+    Raises:
+        ValueError: naming the members that are missing, or the first with an impossible value.
+    """
+    name = f"items {type(stream).__name__}"
+    missing = [member for member in MEMBERS if not hasattr(stream, member)]
     if missing:
         raise ValueError(
-            f"items {type(items).__name__}: needs to be an array or a stream, which also needs "
-            f"{', '.join(missing)}"
+            f"{name}: needs to be an array or a stream, which also needs {', '.join(missing)}"
         )
-    return items  # type: ignore[return-value]  # it has the members of a Stream
+    for member in METHODS:
+        if not callable(getattr(stream, member)):
+            raise ValueError(f"{name}: {member} needs to be a method")
+    whole_number(stream.smallest, f"{name}: smallest", 1)
+    for member in ("episodes", "longest"):
+        if getattr(stream, member) is not None:
+            whole_number(getattr(stream, member), f"{name}: {member}", 1)
+    try:
+        low, high = stream.sides
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: sides needs the shortest and the longest side") from None
+    whole_number(low, f"{name}: shortest of sides", 1)
+    whole_number(high, f"{name}: longest of sides", low)
+    sets = stream.orientation_sets
+    if not isinstance(sets, Mapping) or not sets:
+        raise ValueError(f"{name}: orientation_sets needs a mapping from orientations to shares")
+    result: Stream = stream
+    return result
 
 
 def _generated(name: str, size: Size, sides: tuple[int, int]) -> Stream:

@@ -26,6 +26,7 @@ from marl_pack.geometry import Size
 from marl_pack.items.cutting import cut
 from marl_pack.items.items import ALL_ORIENTATIONS, Items, join
 from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mix
+from marl_pack.items.sequences import Sequences
 
 
 class Stream(Protocol):
@@ -289,6 +290,9 @@ def independent(stream: Stream, sequences: int = 500) -> Stream:
     """
     if isinstance(stream, Uniform | Drawn):
         return stream
+    if isinstance(stream, Sequences):  # in the order in which the loop below collects items
+        order = stream.steps().argsort(stable=True)
+        return Drawn(stream.rows[order], id_names=stream.id_names)
     if stream.longest is None:
         raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
     count = stream.episodes or sequences
@@ -312,6 +316,8 @@ def fingerprint(stream: Stream) -> int:
     for name, value in getattr(stream, "__dict__", {}).items():
         if name == "id_names":
             digest.update(b"" if value is None else repr(value).encode())
+        elif name == "spans" and len(value) == 1:
+            pass  # one sequence, which has all rows
         elif isinstance(value, Items):
             for tensor in value.tensors().values():
                 digest.update(tensor.cpu().numpy().tobytes())
