@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
@@ -20,19 +19,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.bins import Bins
+from marl_pack.checks import number_in, real_number, whole_number
 from marl_pack.files import write_atomically, write_json
 from marl_pack.geometry import ORIENTATIONS
+from marl_pack.inputs import read_json, read_lines
+from marl_pack.items.names import check_names
 
 Array = NDArray[Any]
 
 SLACK = 1e-9
 """Share of a bin's longest side by which rounding may move a face or a centre outside."""
 
+LONGEST = 1e9
+"""The largest length in a plan: products and sums of lengths stay exact enough."""
+
 UNIT = "unit_mm"  # key of the unit in JSON, CSV and .npz
 BOX = (
     "id", "bin", "x", "y", "z", "w", "d", "h", "orientation", "weight", "centre_x", "centre_y"
 )  # fmt: skip
 """Keys of a box in JSON, and the first columns of a CSV file."""
+KEYS = (UNIT, "bins", "boxes")
+"""Keys of a plan in JSON."""
 COLUMNS = (*BOX, "bin_w", "bin_d", "bin_h", UNIT)
 """Columns of a CSV file: every row repeats the size of its bin and the unit."""
 
@@ -66,6 +73,9 @@ class Plan:
         }  # fmt: skip
         arrays = {key: _numbers(key, getattr(self, key), shape) for key, shape in shapes.items()}
         lengths = ("bin_sizes", "positions", "sides")
+        for key in lengths:
+            if (arrays[key] > LONGEST).any():
+                raise ValueError(f"{key}: needs lengths of at most {LONGEST:g}")
         whole = all(arrays[key].dtype.kind in "iu" or not arrays[key].size for key in lengths)
         kinds = dict.fromkeys(lengths, np.int64 if whole else np.float64)
         kinds |= {"bins": np.int64, "orientations": np.int64}
@@ -83,7 +93,7 @@ class Plan:
     def _check_values(self) -> None:
         """Refuse impossible values, naming the first box that has one."""
         unit = self.unit_mm
-        if unit is not None and not (np.isfinite(unit) and unit > 0):
+        if unit is not None and real_number(unit, UNIT) <= 0:
             raise ValueError(f"unit_mm = {unit}: needs a positive length in millimetres")
         if not len(self.bin_sizes) or not (self.bin_sizes > 0).all():
             raise ValueError(f"bin_sizes {self.bin_sizes.tolist()}: needs positive sides W, D, H")
@@ -206,7 +216,7 @@ class Plan:
     @property
     def utilization(self) -> float:
         """Share of the volume of all bins that is filled by boxes."""
-        return float(self.sides.prod(1).sum() / self.bin_sizes.prod(1).sum())
+        return float(_volume(self.sides) / _volume(self.bin_sizes))
 
     def first(self, count: int) -> Plan:
         """Return the plan as it was when ``count`` boxes had been placed."""
@@ -266,12 +276,32 @@ class Plan:
         Raises:
             ValueError: if it is another kind of file, or for an impossible value.
         """
+        path = Path(path)
+        source = f"{path}: not a plan in JSON"
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise ValueError(f"{source}: needs an object with the keys {', '.join(KEYS)}")
+        check_names(content, KEYS, KEYS, source, "key")
+        sizes, boxes = content["bins"], content["boxes"]
         try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-            rows = [[box[key] for key in BOX] for box in content["boxes"]]
-            return cls._of_rows(content["bins"], rows, content[UNIT])
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path}: not a plan in JSON ({error!r})") from None
+            if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
+                raise ValueError("boxes: needs a list of objects")
+            if not isinstance(sizes, list) or not all(isinstance(size, list) for size in sizes):
+                raise ValueError("bins: needs a list of W, D, H")
+            for size in sizes:
+                for side in size:
+                    real_number(side, "bins")
+            for k, box in enumerate(boxes):
+                check_names(box, BOX, BOX, f"box {k}", "key")
+            rows = [[box[key] for key in BOX] for box in boxes]
+            for k, row in enumerate(rows):
+                _check_row(row, f"box {k}")
+            if content[UNIT] is not None:
+                real_number(content[UNIT], UNIT)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+        try:
+            return cls._of_rows(sizes, rows, content[UNIT])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
@@ -303,22 +333,23 @@ class Plan:
         Raises:
             ValueError: if it is another kind of file, or for an impossible value.
         """
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            header, *lines = list(csv.reader(file)) or [[]]
+        path = Path(path)
+        (_, header), *lines = list(read_lines(path)) or [(0, [])]
         if header != list(COLUMNS) or not lines:
             raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and a line for a box")
-        sizes: dict[int, list[float]] = {}
+        sizes: dict[int, list[Any]] = {}
         rows, units = [], set()
-        for number, line in enumerate(lines):
+        for number, (_, line) in enumerate(lines):
             try:
                 if len(line) != len(COLUMNS):
                     raise ValueError(f"has {len(line)} values, needs {len(COLUMNS)}")
                 name, *values, unit = line
-                row = [_number(value) for value in values]
-                if sizes.setdefault(int(row[0]), row[-3:]) != row[-3:]:
-                    raise ValueError(f"bin {row[0]} has another size than before")
-                rows.append([name, *row[:-3]])
-                units.add(float(unit) if unit else None)
+                row: list[Any] = [name, *map(number_in, values)]
+                _check_row(row[:-3], "it")
+                if sizes.setdefault(row[1], row[-3:]) != row[-3:]:
+                    raise ValueError(f"bin {row[1]} has another size than before")
+                rows.append(row[:-3])
+                units.add(number_in(unit) if unit else None)
             except ValueError as error:
                 raise ValueError(f"{path}: box {number}: {error}") from None
         if len(units) > 1 or sorted(sizes) != list(range(len(sizes))):
@@ -340,9 +371,15 @@ def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _number(text: str) -> float:
-    """Return a number of a CSV file, an int if it is written as one."""
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
+def _check_row(row: Sequence[Any], what: str) -> None:
+    """Refuse values of a box, in the order of :data:`BOX`, that are no numbers or no text."""
+    for key, value in zip(BOX, row, strict=True):
+        if key in ("bin", "orientation"):
+            whole_number(value, f"{what}: {key}", -1)
+        elif key != "id":
+            real_number(value, f"{what}: {key}")
+
+
+def _volume(sides: Array) -> float:
+    """Return the volume of all boxes [n, 3]; their product may exceed 64 bits."""
+    return float(sides.astype(np.float64).prod(1).sum())

@@ -13,9 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.files import write_atomically
+from marl_pack.inputs import read_arrays
+from marl_pack.items.names import check_names
 from marl_pack.plan import UNIT, Plan
 
 NOT_PLANS = "not a file of plans, as evaluate --save-stacks writes it"
+REQUIRED = ("bin", "count", "boxes", "loads")
+NAMES = (*REQUIRED, "utilization", "orientations", "ids", "bins", UNIT)
+"""Names of the arrays of an archive."""
 
 
 def save_plans(path: Path, plans: Sequence[Plan]) -> None:
@@ -66,15 +71,11 @@ def load_plans(path: str | Path) -> list[Plan]:
         ValueError: if it is another kind of file, or for an impossible value.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
-        size, count, boxes, loads = (arrays[key] for key in ("bin", "count", "boxes", "loads"))
-    except OSError as error:
-        if Path(path).is_file():
-            raise ValueError(f"{path}: {NOT_PLANS}") from error
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: {NOT_PLANS}") from error
+        arrays = read_arrays(Path(path))
+        check_names(arrays, NAMES, REQUIRED, str(path), "array")
+    except ValueError as error:
+        raise ValueError(f"{path}: {NOT_PLANS}{str(error).removeprefix(str(path))}") from None
+    size, count, boxes, loads = (arrays[key] for key in REQUIRED)
     e, most = boxes.shape[:2] if boxes.ndim == 3 else (0, 0)
     arrays = {
         "orientations": np.full((e, most), -1), "ids": np.full((e, most), ""),
@@ -85,7 +86,8 @@ def load_plans(path: str | Path) -> list[Plan]:
         boxes.shape == (e, most, 6) and loads.shape == (e, most, 3)
         and sizes.ndim == 3 and (len(sizes), sizes.shape[2]) == (e, 3)
         and all(arrays[key].shape == (e, most) for key in ("orientations", "ids", "bins"))
-        and count.shape == arrays[UNIT].shape == (e,) and count.dtype.kind in "iu"
+        and count.shape == arrays[UNIT].shape == (e,) and count.dtype.kind in "iu" and e > 0
+        and arrays[UNIT].dtype.kind in "iuf" and arrays["ids"].dtype.kind == "U"
         and (boxes.dtype.kind in "iu") == (size.dtype.kind in "iu")
         and bool(((count >= 0) & (count <= most)).all())
     )  # fmt: skip
@@ -96,7 +98,7 @@ def load_plans(path: str | Path) -> list[Plan]:
         unit = float(arrays[UNIT][k])
         try:
             plans.append(Plan(
-                sizes[k][(sizes[k] > 0).any(1)], arrays["bins"][k, :n], boxes[k, :n, :3],
+                sizes[k][(sizes[k] != 0).any(1)], arrays["bins"][k, :n], boxes[k, :n, :3],
                 boxes[k, :n, 3:], arrays["orientations"][k, :n], loads[k, :n, 0],
                 loads[k, :n, 1:], tuple(arrays["ids"][k, :n].tolist()),
                 None if np.isnan(unit) else unit,

@@ -45,7 +45,8 @@ def check_size(size: Size) -> Size:
         raise ValueError(f"bin size {shown(size)}: needs three whole numbers of cells ≥ 1, W D H")
     if sides[2] > MAX_HEIGHT or max(sides) > MAX_SIDE:
         raise ValueError(
-            f"bin size {shown(size)}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger cells"
+            f"bin size {shown(size)}: at most {MAX_SIDE} x {MAX_SIDE} x {MAX_HEIGHT}; use larger "
+            "cells"
         )
     return int(sides[0]), int(sides[1]), int(sides[2])
 

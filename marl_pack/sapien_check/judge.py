@@ -42,6 +42,7 @@ SAMPLE = 0.05  # seconds between looks at the boxes
 CREEP = 0.1  # share of a threshold from which on a box may be about to fall
 LONGEST = 0.3  # metres; boxes are scaled so that their longest side is the paper's longest
 THINNEST = 1 / 50  # of the longest side: below, the thresholds would be a large part of a box
+WIDEST = 3000.0  # ratio of the longest sides of bin and boxes: beyond, boxes may be over 1 km away
 HEAVY = 100.0  # ratio of masses from which on a fall has to survive Physics.heavy as well
 HEAVIEST = 1e4  # ratio of masses beyond which the solver cannot be trusted
 
@@ -78,6 +79,12 @@ def check(stack: Stack, physics: Physics = DEFAULT) -> Verdict:
     if thinnest < THINNEST:
         raise SimulationError(
             f"the shortest side is {thinnest:.3g} of the longest; the judge needs {THINNEST:g}"
+        )
+    widest = float(stack.size.max() / stack.sides.max())
+    if widest > WIDEST:
+        raise SimulationError(
+            f"the bin is {widest:.3g} times as long as the longest box; the judge goes to "
+            f"{WIDEST:g}"
         )
     ratio = float(stack.mass.max() / stack.mass.min())
     if ratio > HEAVIEST:

@@ -13,8 +13,12 @@ from marl_pack.plan import Plan
 
 Floats = NDArray[np.float64]
 
-SLACK = 1e-6
-"""Metres by which faces may miss one another and still count as touching, not overlapping."""
+SLACK = 1e-6 / 0.3
+"""Share of the longest side of the boxes by which faces may miss one another and still count as
+touching, not overlapping: 1e-6 m for the paper's longest box."""
+
+MOST_BOXES = 3000
+"""The most boxes of a stack: all pairs of boxes are compared."""
 
 PAPER_BIN = 0.6
 """Edge of the paper's bin in metres (sec. IV-A)."""
@@ -152,11 +156,16 @@ class Stack:
         arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
+    @property
+    def slack(self) -> float:
+        """Metres by which faces may miss one another and still count as touching."""
+        return SLACK * float(self.sides.max(initial=0.0))
+
     def rests_on(self) -> NDArray[np.bool_]:
         """Return, bool [n, n], whether box i touches box j from above on more than an edge."""
         low, high = self.low, self.high
-        meet = np.abs(low[:, None, 2] - high[None, :, 2]) < SLACK
-        return meet & (overlaps(low, high)[..., :2] > SLACK).all(-1)
+        meet = np.abs(low[:, None, 2] - high[None, :, 2]) < self.slack
+        return meet & (overlaps(low, high)[..., :2] > self.slack).all(-1)
 
     def check(self, named: NDArray[np.floating[Any]] | None = None) -> None:
         """Refuse a stack that cannot exist.
@@ -168,17 +177,19 @@ class Stack:
             ValueError: naming the first box that overlaps an earlier one, floats or reaches out of
                 the bin.
         """
+        if len(self) > MOST_BOXES:
+            raise ValueError(f"{len(self)} boxes: needs at most {MOST_BOXES}")
         rows = np.hstack([self.low, self.sides]) if named is None else named
         _refuse(
             ~np.isfinite(np.hstack([self.low, self.sides])).all(1), rows, "needs finite numbers"
         )
         _refuse((self.sides <= 0).any(1), rows, "needs sides longer than 0")
-        out = (self.low < -SLACK) | (self.high > self.size + SLACK)
+        out = (self.low < -self.slack) | (self.high > self.size + self.slack)
         _refuse(out.any(1), rows, "reaches out of the bin")
-        shared = np.tril((overlaps(self.low, self.high) > SLACK).all(-1), -1)
+        shared = np.tril((overlaps(self.low, self.high) > self.slack).all(-1), -1)
         for i, j in np.argwhere(shared)[:1]:
             raise ValueError(f"{_name(i, rows)} overlaps {_name(j, rows)}")
-        resting = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < SLACK)
+        resting = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < self.slack)
         _refuse(~resting, rows, "floats: it rests neither on the floor nor on an earlier box")
 
 

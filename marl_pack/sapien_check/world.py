@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marl_pack.sapien_check.stack import SLACK, Floats, Stack, overlaps
+from marl_pack.sapien_check.stack import Floats, Stack, overlaps
 
 GROUND_BIT = 31  # of the collision groups: the floor
 WALL = 0.05  # metres, thickness of the walls
@@ -235,6 +235,6 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     second = [0] * n
     for i, j in np.argwhere(on):
         second[i] |= first[j]
-    for i in np.flatnonzero(stack.low[:, 2] < SLACK):
+    for i in np.flatnonzero(stack.low[:, 2] < stack.slack):
         second[i] |= 1 << GROUND_BIT
     return [[a, b, 0, 0] for a, b in zip(first, second, strict=True)]
