@@ -76,5 +76,10 @@ def shown(value: Any) -> str:
         text = repr(value.item() if isinstance(value, np.generic) else value)
     except (ValueError, RecursionError):  # an int of more digits than Python writes
         text = f"a {type(value).__name__} that is too long to show"
-    text = " ".join(text.split())
-    return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 3]}..."
+    return one_line(text)
+
+
+def one_line(text: str, longest: int = LONGEST_TEXT) -> str:
+    """Return a text in one line, cut off after ``longest`` characters."""
+    line = " ".join(text.split())
+    return line if len(line) <= longest else f"{line[: longest - 3]}..."

@@ -17,6 +17,8 @@ from typing import Any
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from marl_pack.checks import one_line
+
 MAX_TEXT = 256 << 20
 """Bytes of the largest JSON or CSV file."""
 MAX_ARRAYS = 512 << 20
@@ -48,7 +50,7 @@ def read_json(path: Path) -> Any:
     except RecursionError:
         reason = "it is nested too deeply"
     except (json.JSONDecodeError, KeyError) as error:
-        reason = str(error.args[0])
+        reason = one_line(str(error.args[0]), 200)
     except ValueError:  # Python's limit of digits
         reason = "it has a number of thousands of digits"
     raise ValueError(f"{path}: not readable as JSON ({reason})")
@@ -98,7 +100,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                     raise ValueError("it has two arrays of one name")
                 return arrays
         except Exception as error:  # a broken archive raises errors of a dozen types
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = one_line(str(error), 200) or type(error).__name__
             raise ValueError(f"{path}: not a readable .npz archive ({reason})") from None
 
 

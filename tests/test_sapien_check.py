@@ -218,6 +218,29 @@ def test_a_verdict_does_not_depend_on_units_of_mass_and_length(unit: float, cell
         assert check(pile).stands == stands
 
 
+@pytest.mark.parametrize("cell", [1e-12, 0.06, 1e12])
+def test_what_touches_and_overlaps_does_not_depend_on_the_unit(cell: float) -> None:
+    near = Stack.of_cells(BIN, [FLAT, (0, 0, 2 - 1e-9, 4, 4, 1)], cell=cell, mass=1.0)
+    assert near.rests_on()[1, 0]
+    for row, why in (((0, 0, 1.999, 4, 4, 1), "overlaps"), ((0, 0, 2.001, 4, 4, 1), "floats")):
+        with pytest.raises(ValueError, match=why):
+            Stack.of_cells(BIN, [FLAT, row], cell=cell, mass=1.0)
+
+
+def test_a_cube_in_a_far_corner_stands_or_is_not_judged() -> None:
+    for side in (1000, 2999):
+        far = [(side - 1, side - 1, k, 1, 1, 1) for k in range(2)]
+        assert check(Stack.of_cells((side, side, 9), far, mass=1.0)).stands
+    with pytest.raises(SimulationError, match=r"bin is 1e\+09 times as long .*goes to 3000"):
+        check(Stack.of_cells((10**9, 10**9, 9), [(0, 0, 0, 1, 1, 1)], mass=1.0))
+
+
+def test_a_stack_of_too_many_boxes_is_refused() -> None:
+    cubes = [(x, y, 0, 1, 1, 1) for x in range(60) for y in range(51)]
+    with pytest.raises(ValueError, match="3060 boxes: needs at most 3000"):
+        Stack.of_cells((60, 60, 60), cubes, mass=1.0)
+
+
 def test_heavy_boxes_on_light_ones_stand() -> None:
     column = [(0, 0, k, 4, 4, 1) for k in range(8)]
     for ratio in (1e3, 9e3):
