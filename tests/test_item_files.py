@@ -139,6 +139,19 @@ def test_sequences_of_rows_play_as_padded_tables() -> None:
         assert torch.equal(values, right.tensors()[name]), name
 
 
+@pytest.mark.parametrize("key", ["items", "weights", "lengths"])
+def test_masked_values_are_refused(key: str) -> None:
+    goods = {
+        "items": np.full((2, 2, 3), 2),
+        "weights": np.ones((2, 2)),
+        "lengths": np.array([2, 2]),
+    }
+    assert make_stream(goods, BIN).longest == 2
+    goods[key] = np.ma.masked_array(goods[key], np.ones_like(goods[key], bool))
+    with pytest.raises(ValueError, match="items: has masked values; needs them left out"):
+        make_stream(goods, BIN)
+
+
 def test_where_a_sequence_ends_is_part_of_its_fingerprint() -> None:
     rows = [[2, 2, 2], [3, 3, 3], [4, 4, 4]]
     ends = [[rows], [rows[:1], rows[1:]], [rows[:2], rows[2:]]]

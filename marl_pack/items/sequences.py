@@ -210,7 +210,7 @@ def split_sequences(items: Any, source: str) -> tuple[Sequence[Any] | NDArray[An
         ValueError: if ``items`` are neither [L, 3] nor [S, L, 3] nor a list.
     """
     if hasattr(items, "__array__"):
-        array = np.asarray(items)
+        array = _array(items, source)
         if array.ndim not in (2, 3) or array.shape[-1] != 3 or 0 in array.shape:
             raise ValueError(f"{source}: shape {array.shape}, needs [L, 3] or [S, L, 3] (w, d, h)")
         return array if array.ndim == 3 else array[None], array.ndim == 2
@@ -219,6 +219,13 @@ def split_sequences(items: Any, source: str) -> tuple[Sequence[Any] | NDArray[An
     first = items[0]
     single = not (_is_list(first) and len(first) and _is_list(first[0]))
     return [items] if single else list(items), single
+
+
+def _array(values: Any, source: str) -> NDArray[Any]:
+    """Return an array; refuse one that hides values behind a mask."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{source}: has masked values; needs them left out")
+    return np.asarray(values)
 
 
 def _is_list(values: object) -> bool:
@@ -292,7 +299,7 @@ def _ends(rows: Rows, lengths: Any) -> NDArray[np.int64]:
     counts = rows.counts
     if lengths is not None:
         plain = isinstance(lengths, np.ndarray) or (_is_list(lengths) and only_numbers(lengths))
-        numbers = np.asarray(lengths) if plain else np.zeros(0)
+        numbers = _array(lengths, rows.source) if plain else np.zeros(0)
         whole = numbers.shape == counts.shape and numbers.dtype.kind in "iu"
         if not whole or not ((numbers >= 1) & (numbers <= counts)).all():
             raise ValueError(
@@ -364,7 +371,7 @@ def _flatten(values: Any, rows: Rows) -> list[Any] | NDArray[Any] | None:
     """
     if isinstance(values, Ragged):
         return values.values
-    values = np.asarray(values) if hasattr(values, "__array__") else values
+    values = _array(values, rows.source) if hasattr(values, "__array__") else values
     counts = rows.counts.tolist()
     if isinstance(values, np.ndarray) and values.shape[:2] == (len(counts), counts[0]) != (1, 1):
         return values.reshape(-1, *values.shape[2:]) if len(set(counts)) == 1 else None
