@@ -181,6 +181,7 @@ def place(
     weights: Tensor | None = None,
     com: Tensor | None = None,
     labels: tuple[Tensor, Tensor] | None = None,
+    unit: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin from above, in place (Algorithm 2 for the empty map).
 
@@ -192,8 +193,11 @@ def place(
         sides: int [N, 3], the boxes' sides along x, y, z.
         corners: int64 [N, 2], the low corners (x, y).
         weights: float [N]; the boxes' volumes by default.
-        com: float [N, 2], centre of mass from the low corner; the footprint's centre by default.
+        com: float [N, 2], centre of mass from the low corner in units; the footprint's centre by
+            default.
         labels: ids and orientations of the boxes' items, int64 [N] each; unknown (-1) by default.
+        unit: units of ``com`` in a cell. With whole numbers in ``com`` the stored centres are those
+            numbers rounded once, so that they are the nearest to the exact ones.
 
     Returns:
         Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
@@ -204,7 +208,7 @@ def place(
             has changed then.
     """
     code = bins.backend.pick(compiled=_place_compiled, tensor=_place_tensor)
-    return code(bins, sides, corners, weights, com, labels)
+    return code(bins, sides, corners, weights, com, labels, unit)
 
 
 def _refuse(bins: Bins, full: bool) -> None:
@@ -240,7 +244,7 @@ def _obstacle(most: int, shape: tuple[int, int], count: Any, sides: Any, corners
 @njit(cache=True, nogil=True)
 def _place_each(
     heightmap: Any, empty_map: Any, boxes: Any, loads: Any, labels: Any, count: Any, filled: Any,
-    sides: Any, corners: Any, weights: Any, com: Any, ids: Any, orientations: Any,
+    sides: Any, corners: Any, weights: Any, com: Any, ids: Any, orientations: Any, unit: float,
     resting_height: Any, waste: Any, volume: Any,
 ) -> None:  # fmt: skip
     """Place one box in each bin; empty arrays stand for the defaults of optional arguments."""
@@ -256,8 +260,8 @@ def _place_each(
         box, load, label = boxes[b, k], loads[b, k], labels[b, k]
         box[0], box[1], box[2], box[3], box[4], box[5] = x, y, z, w, d, h
         load[0] = weights[b] if weights.size else float(w) * d * h
-        load[1] = x + (com[b, 0] if com.size else w / 2)
-        load[2] = y + (com[b, 1] if com.size else d / 2)
+        load[1] = (x * unit + com[b, 0]) / unit if com.size else x + w / 2
+        load[2] = (y * unit + com[b, 1]) / unit if com.size else y + d / 2
         label[0] = ids[b] if ids.size else UNKNOWN
         label[1] = orientations[b] if orientations.size else UNKNOWN
         count[b] += 1
@@ -271,6 +275,7 @@ def _place_compiled(
     weights: Tensor | None,
     com: Tensor | None,
     labels: tuple[Tensor, Tensor] | None,
+    unit: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin in compiled loops; arguments as :func:`place`."""
     state = [tensor.numpy() for tensor in bins.tensors()]
@@ -286,6 +291,7 @@ def _place_compiled(
         np.empty(0) if weights is None else weights.double().numpy(),
         np.empty((0, 2)) if com is None else com.double().numpy(),
         *(NO_LABELS if labels is None else (label.numpy() for label in labels)),
+        unit,
         resting_height.numpy(),
         waste.numpy(),
         volume.numpy(),
@@ -303,6 +309,7 @@ def _place_tensor(
     weights: Tensor | None,
     com: Tensor | None,
     labels: tuple[Tensor, Tensor] | None,
+    unit: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin in tensor code; arguments as :func:`place`."""
     volume = sides.long().prod(1)
@@ -317,9 +324,11 @@ def _place_tensor(
     resting_height, waste = place_boxes(bins.heightmap, bins.empty_map, under, sides[:, 2])
 
     box = torch.cat((corners, resting_height[:, None], sides), 1).to(bins.boxes.dtype)
-    centre = sides[:, :2].double() / 2 if com is None else com.double()
+    centre = corners + sides[:, :2].double() / 2
+    if com is not None:
+        centre = (corners * unit + com.double()) / unit
     weight = volume.double() if weights is None else weights.double()
-    load = torch.cat((weight[:, None], corners + centre), 1)
+    load = torch.cat((weight[:, None], centre), 1)
     label = torch.full_like(corners, UNKNOWN) if labels is None else torch.stack(labels, 1)
     index = torch.arange(len(bins), device=bins.device)
     slot = bins.count.clamp(max=bins.boxes.shape[1] - 1)

@@ -290,13 +290,15 @@ class Packing:
             state.lost = state.lost | (alive & ~possible)
         if not (self.auto_reset and self.spec.mask_orientations):
             sides = torch.where((alive & ~state.lost)[:, None], sides, 0)
-        com = None
+        com, unit = None, 1.0
         if any(self.spec.com_offset):
-            com = Moves.gather(self.orient_item(self.items).centres(), orientation)
+            item = self.orient_item(self.items)
+            centres = item.centre_table(0.0, max(state.bins.size[:2]))
+            com, unit = Moves.gather(centres.units(item.sides), orientation), centres.unit
         corners = self.floor.corners(cell, self.backend)
         labels = self.items.ids_at(state.t), orientation
         _, waste, volume = bin_state.place(
-            state.bins, sides, corners, self.items.weights, com, labels
+            state.bins, sides, corners, self.items.weights, com, labels, unit
         )
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * volume).sub_(waste, alpha=self._loss).float()

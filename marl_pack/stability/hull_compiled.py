@@ -26,7 +26,8 @@ from numba import njit
 from torch import Tensor, from_numpy
 
 from marl_pack.geometry.compiled import mark_valid, slide
-from marl_pack.stability.hull_exact import UNDECIDED, YES, solve_undecided
+from marl_pack.stability.centres import CentreTable
+from marl_pack.stability.hull_exact import OUTSIDE, UNDECIDED, UNSURE, YES, solve_undecided
 from marl_pack.stability.mask_runs import earlier_equals, in_bin, runs_of_footprints
 
 RUN_CELLS = 1024
@@ -192,7 +193,7 @@ def _write_run(
         if _write_mask(codes[j], flat_out[i]):
             solve_undecided(
                 codes[j], tops[j * cells : (j + 1) * cells], levels[i // count], w, d, w / 2,
-                d / 2, 0.0, scratch, out[i // count, i % count],
+                d / 2, 1.0, 0.0, True, scratch, out[i // count, i % count],
             )  # fmt: skip
         if flat_best.size:
             _copy(tops[j * cells : (j + 1) * cells], flat_best[i])
@@ -236,9 +237,9 @@ def _keep_supported(
 
 @njit(cache=True, nogil=True)
 def general_masks(
-    heightmap: Any, empty_map: Any, sides: Any, com: Any, margin: float, height: int, levels: Any,
-    out: Any,
-) -> None:  # fmt: skip
+    heightmap: Any, empty_map: Any, sides: Any, at: Any, low: Any, start: Any, unit: float,
+    margin: float, whole: bool, height: int, levels: Any, out: Any,
+) -> int:  # fmt: skip
     """Compute masks for any centre of mass and safety margin.
 
     Halves and quadrants begin ``margin`` away from the centre of mass here. Contact reaching into
@@ -246,38 +247,49 @@ def general_masks(
     the hull; none in one of the four halves leaves a side of the hull within ``margin`` of it.
 
     Args:
-        com: float64 [N, A, 2], centre of mass from the window's low corner.
-        margin: cells by which the support polygon is shrunk, ≥ 0.
-        heightmap, empty_map, sides, height, levels, out: as in :func:`central_masks`.
+        at, low, start, unit, margin, whole: of a :class:`marl_pack.stability.centres.CentreTable`
+            for windows as long as the map.
+        heightmap, empty_map, sides, height, levels: as in :func:`central_masks`.
+        out: uint8 [N, A, W, D], written: OUTSIDE, INSIDE or UNSURE.
+
+    Returns:
+        The number of windows that are UNSURE.
     """
     n, width, depth = heightmap.shape
     cells = width * depth
     fill_levels(heightmap.reshape(-1), empty_map.reshape(-1), levels.reshape(-1))
     buffers = np.empty((2, cells), levels.dtype)
-    whole = np.empty(cells, levels.dtype)
+    largest = np.empty(cells, levels.dtype)
+    unsure = 0
     codes = np.empty(cells, np.uint8)
     scratch = np.empty((3, 2 * width + 2, 2), np.int64)
     for b in range(n):
         plane = levels[b].reshape(cells)
         for a in range(sides.shape[1]):
             w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
-            x, y = com[b, a, 0], com[b, a, 1]
-            low = int(np.ceil(x - margin)), int(np.ceil(y - margin))
-            high = w - int(np.floor(x + margin)), d - int(np.floor(y + margin))
             plane_out = out[b, a].reshape(cells)
-            if not in_bin(w, d, h, width, depth, height) or min(min(low), min(high)) <= 0:
-                plane_out[:] = 0
+            if not in_bin(w, d, h, width, depth, height):
+                plane_out[:] = OUTSIDE
+                continue
+            below = low[a, 0, w], low[a, 1, d]
+            above = w - start[a, 0, w], d - start[a, 1, d]
+            if min(min(below), min(above)) <= 0:
+                plane_out[:] = OUTSIDE
                 continue
             mark_valid(codes, width, depth, w, d, YES | UNDECIDED)
             m = (width - w) * depth + depth - d + 1
             best = slide(plane, buffers[0], buffers[1], depth, w, d)
-            whole[:m] = best[:m]
+            largest[:m] = best[:m]
             for i in range(m):
-                if whole[i] & 1 == 0 or whole[i] > 2 * (height - h) + 1:
+                if largest[i] & 1 == 0 or largest[i] > 2 * (height - h) + 1:
                     codes[i] = 0
-            _keep_supported(plane, buffers, depth, w, d, low, high, whole[:m], codes)
+            _keep_supported(plane, buffers, depth, w, d, below, above, largest[:m], codes)
             if _write_mask(codes, plane_out):
-                solve_undecided(codes, whole, levels[b], w, d, x, y, margin, scratch, out[b, a])
+                x, y = at[a, 0, w], at[a, 1, d]
+                unsure += solve_undecided(
+                    codes, largest, levels[b], w, d, x, y, unit, margin, whole, scratch, out[b, a]
+                )
+    return unsure
 
 
 def level_dtype(height: int) -> type[np.generic]:
@@ -290,27 +302,33 @@ def support_mask(
     empty_map: Tensor,
     sides: Tensor,
     height: int,
-    com: Tensor | None = None,
-    margin: float = 0.0,
-) -> Tensor:
-    """Compute where each box fits and its centre of mass is supported, bool [N, A, W, D].
+    centres: CentreTable | None = None,
+) -> tuple[Tensor, Tensor | None]:
+    """Compute where each box fits and its centre of mass is supported.
 
     Args:
         heightmap: int16 [N, W, D].
         empty_map: int16 or bool [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H.
-        com: float64 [N, A, 2] from the window's low corner; the middle by default.
-        margin: cells by which the support polygon is shrunk.
+        centres: of mass, with the margin; None: in the middle, without a margin.
+
+    Returns:
+        The mask, bool [N, A, W, D], and the windows int64 [U, 4] (rows n, a, x, y) that exact
+        fractions must decide; None if there are none.
     """
     n, width, depth = heightmap.shape
     maps = [np.ascontiguousarray(values.numpy()) for values in (heightmap, empty_map)]
     boxes = np.ascontiguousarray(sides.numpy())
     out = np.empty((n, boxes.shape[1], width, depth), np.uint8)
     levels = np.empty(maps[0].shape, level_dtype(height))
-    if com is None and margin == 0:
+    unsure = None
+    if centres is None:
         central_masks(*maps, boxes, height, levels, out, np.empty((0, 0, 0, 0), levels.dtype))
-    else:
-        centres = np.ascontiguousarray(boxes[..., :2] / 2 if com is None else com.numpy())
-        general_masks(*maps, boxes, centres, margin, height, levels, out)
-    return from_numpy(out.view(np.bool_))
+    elif general_masks(
+        *maps, boxes, centres.at, centres.low, centres.start, centres.unit, centres.margin,
+        centres.whole, height, levels, out,
+    ):  # fmt: skip
+        unsure = from_numpy(np.argwhere(out == UNSURE))
+        out[out == UNSURE] = OUTSIDE
+    return from_numpy(out.view(np.bool_)), unsure

@@ -15,6 +15,12 @@ YES, UNDECIDED = 2, 1
 """Codes of a window: its centre of mass is inside the hull, or the exact test must decide. Every
 YES also passes the weaker test: 1 + 1."""
 
+OUTSIDE, INSIDE, UNSURE = 0, 1, 2
+"""Verdicts of the exact test. UNSURE: float64 cannot tell, so exact fractions must decide."""
+
+ROUNDING = 2.0**-48
+"""Relative error of the distance to an edge that float64 never exceeds."""
+
 LOOKUP_CELLS = 64
 """Windows of more cells than this find the extremes of their rows in tables of the whole map."""
 
@@ -75,39 +81,63 @@ def envelope(lo: Any, hi: Any, upper: Any, lower: Any) -> tuple[int, int]:
 
 
 @njit(cache=True)
-def _beyond_chain(chain: Any, size: int, sign: int, x: float, y: float, margin: float) -> bool:
-    """Return whether (x, y) is more than ``margin`` on the inner side of every edge of a chain."""
+def _beyond_chain(
+    chain: Any, size: int, sign: int, x: float, y: float, unit: float, margin: float, whole: bool
+) -> int:
+    """Decide whether (x, y) is more than ``margin`` on the inner side of every edge of a chain."""
+    verdict = INSIDE
     for i in range(size - 1):
-        ax, ay = chain[i, 0], chain[i, 1]
-        ex, ey = chain[i + 1, 0] - ax, chain[i + 1, 1] - ay
-        cross = sign * (ex * (y - ay) - ey * (x - ax))  # exact in whole and half cells
-        if cross >= 0 or -cross <= margin * np.sqrt(float(ex * ex + ey * ey)):
-            return False
-    return True
+        ax, ay = chain[i, 0] * unit, chain[i, 1] * unit
+        ex, ey = chain[i + 1, 0] - chain[i, 0], chain[i + 1, 1] - chain[i, 1]
+        length = np.sqrt(float(ex * ex + ey * ey))
+        distance = sign * (ey * (x - ax) - ex * (y - ay)) - margin * length
+        error = 0.0
+        if not whole or (margin > 0.0 and length != np.floor(length)):
+            error = ROUNDING * (abs(ex) * (abs(y) + ay) + abs(ey) * (abs(x) + ax) + margin * length)
+        if distance <= -error:
+            return OUTSIDE
+        if distance <= error:
+            verdict = UNSURE
+    return verdict
 
 
 @njit(cache=True)
-def inside(lo: Any, hi: Any, upper: Any, lower: Any, x: float, y: float, margin: float) -> bool:
-    """Return whether (x, y) lies more than ``margin`` inside the hull of the rows' squares.
+def inside(
+    lo: Any, hi: Any, upper: Any, lower: Any, x: float, y: float, unit: float, margin: float,
+    whole: bool,
+) -> int:  # fmt: skip
+    """Decide whether (x, y) lies more than ``margin`` inside the hull of the rows' squares.
 
     Args:
         lo: int64 [w], as for :func:`envelope`.
         hi: int64 [w], as for :func:`envelope`.
         upper: int64 [2w + 2, 2], scratch.
         lower: int64 [2w + 2, 2], scratch.
-        x: the point's x in cells.
-        y: the point's y in cells.
-        margin: least distance from the hull's edge in cells, ≥ 0.
+        x: the point's x, in units.
+        y: the point's y, in units.
+        unit: units in a cell.
+        margin: least distance from the hull's edge in units, ≥ 0.
+        whole: whether float64 is exact on x, y and margin (:class:`CentreTable`).
+
+    Returns:
+        OUTSIDE, INSIDE or UNSURE.
     """
     n_upper, n_lower = envelope(lo, hi, upper, lower)
     if n_upper == 0:
-        return False
-    first, last = upper[0, 0], upper[n_upper - 1, 0]
-    if x - first <= margin or last - x <= margin:
-        return False
-    return _beyond_chain(upper, n_upper, 1, x, y, margin) and _beyond_chain(
-        lower, n_lower, -1, x, y, margin
-    )
+        return OUTSIDE
+    first, last = upper[0, 0] * unit, upper[n_upper - 1, 0] * unit
+    distance = min(x - first, last - x) - margin
+    error = 0.0 if whole else ROUNDING * (abs(x) + last + margin)
+    if distance <= -error:
+        return OUTSIDE
+    verdict = UNSURE if distance <= error else INSIDE
+    for side in range(2):
+        chain, size, sign = (upper, n_upper, 1) if side == 0 else (lower, n_lower, -1)
+        beyond = _beyond_chain(chain, size, sign, x, y, unit, margin, whole)
+        if beyond == OUTSIDE:
+            return OUTSIDE
+        verdict = max(verdict, beyond)
+    return verdict
 
 
 @njit(cache=True)
@@ -175,10 +205,10 @@ def _level_extremes(
 
 @njit(cache=True)
 def solve_undecided(
-    codes: Any, best: Any, levels: Any, w: int, d: int, x: float, y: float, margin: float,
-    scratch: Any, out: Any,
-) -> None:  # fmt: skip
-    """Write the verdict on every UNDECIDED window of a map.
+    codes: Any, best: Any, levels: Any, w: int, d: int, x: float, y: float, unit: float,
+    margin: float, whole: bool, scratch: Any, out: Any,
+) -> int:  # fmt: skip
+    """Write the verdict on every UNDECIDED window of a map: OUTSIDE, INSIDE or UNSURE.
 
     Args:
         codes: uint8 [W · D], the windows' codes.
@@ -186,16 +216,22 @@ def solve_undecided(
         levels: integers [W, D], K of every column.
         w: the windows' cells along x.
         d: the windows' cells along y.
-        x: the centre of mass along x, from the window's low corner.
-        y: the centre of mass along y, from the window's low corner.
-        margin: cells by which the support polygon is shrunk.
+        x: the centre of mass along x, from the window's low corner, in units.
+        y: the centre of mass along y, from the window's low corner, in units.
+        unit: units in a cell.
+        margin: units by which the support polygon is shrunk.
+        whole: whether float64 is exact on x, y and margin.
         scratch: int64 [3, 2W + 2, 2].
         out: uint8 [W, D], written at the undecided positions.
+
+    Returns:
+        The number of windows that are UNSURE.
     """
     width, depth = levels.shape
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
     upper, lower = scratch[1], scratch[2]
-    middle = margin == 0.0 and 2 * x == w and 2 * y == d
+    middle = margin == 0.0 and 2 * x == w * unit and 2 * y == d * unit
+    unsure = 0
     # Large windows come in clusters over the same level: mark its cells once, then look up.
     marks = np.empty((2, width, depth) if w * d > LOOKUP_CELLS else (2, 0, 0), np.int16)
     following, preceding = marks[0], marks[1]
@@ -217,4 +253,6 @@ def solve_undecided(
         if middle:
             out[cx, cy] = middle_inside(lo, hi, d)
         else:
-            out[cx, cy] = inside(lo, hi, upper, lower, x, y, margin)
+            out[cx, cy] = inside(lo, hi, upper, lower, x, y, unit, margin, whole)
+            unsure += out[cx, cy] == UNSURE
+    return unsure

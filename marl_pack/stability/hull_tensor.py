@@ -12,43 +12,66 @@ from torch import Tensor
 
 from marl_pack.geometry import MAX_HEIGHT
 from marl_pack.geometry.tensor import cut_windows, shift, slide, windows_inside
+from marl_pack.stability.centres import CentreTable, centre_table
+from marl_pack.stability.hull_exact import ROUNDING
 
+CENTRAL = centre_table(((0.0, 0.0),), 0.0, 0)
+"""The unit of centres in the middle: half a cell. There is no margin."""
 PAIR_CELLS = 1 << 24
 """Largest number of elements of the exact test's [windows, points, points, points] at a time."""
 
 
-def _below_chain(points: Tensor, present: Tensor, com: Tensor, margin: float) -> Tensor:
-    """Return whether ``com`` lies strictly below the upper chain of each hull, by ``margin``.
+def _below_chain(
+    points: Tensor, present: Tensor, com: Tensor, centres: CentreTable
+) -> tuple[Tensor, Tensor]:
+    """Decide whether ``com`` lies strictly below the upper chain of each hull, by the margin.
 
     The chain at x is the highest of the lines between a point left and a point right of x, so
     without a margin one such line above ``com`` is enough. With one, ``com`` is measured against
     every edge: a pair of points that no other point lies above.
 
     Args:
-        points: float64 [U, P], height of the hull's boundary points over x = 0 … P - 1.
+        points: float64 [U, P], height of the hull's boundary points over x = 0 … P - 1, in cells.
         present: bool [U, P], which of them exist.
-        com: float64 [U, 2].
-        margin: in cells.
+        com: float64 [U, 2], in units of ``centres``.
+        centres: with the margin and the unit.
+
+    Returns:
+        Whether it surely does and whether it possibly does, bool [U] each. They are equal where
+        float64 is exact.
     """
     size = points.shape[1]
+    unit, margin = centres.unit, centres.margin
     x = torch.arange(size, dtype=torch.float64, device=points.device)
     ex = x[None, :] - x[:, None]  # [i, j]
     ey = points[:, None, :] - points[:, :, None]  # [U, i, j]
     pair = present[:, :, None] & present[:, None, :] & (ex > 0)
-    # cross of (i → j) with (i → com): negative where com lies below the line
-    run, rise = com[:, 0, None] - x, com[:, 1, None] - points
-    cross = ex * rise[:, :, None] - ey * run[:, :, None]
+    # cross of (i → com) with (i → j): positive where com lies below the line
+    run, rise = com[:, 0, None] - x * unit, com[:, 1, None] - points * unit
+    cross = ey * run[:, :, None] - ex * rise[:, :, None]
+    reach = com.abs()[:, :, None] + unit * torch.stack((x.expand_as(points), points.abs()), 1)
+    reach = ey.abs() * reach[:, 0, :, None] + ex.abs() * reach[:, 1, :, None]
     if margin == 0:
-        around = (run >= 0)[:, :, None] & (run <= 0)[:, None, :]
-        return (pair & around & (cross < 0)).flatten(1).any(1)
+        error = 0.0 if centres.whole else ROUNDING * reach
+        slack = 0.0 if centres.whole else ROUNDING * unit * size
+        sure, possible = pair & (cross > error), pair & (cross >= -error)
+        if centres.whole:
+            possible = sure
+        sure &= (run >= 0)[:, :, None] & (run <= 0)[:, None, :]
+        possible &= (run >= -slack)[:, :, None] & (run <= slack)[:, None, :]
+        return sure.flatten(1).any(1), possible.flatten(1).any(1)
     # cross of (i → j) with (i → k): positive where k lies above the line
     above = (
         ex[None, :, :, None] * (points[:, None, None, :] - points[:, :, None, None])
         - ey[..., None] * (x - x[:, None])[None, :, None, :]
     )
     edge = pair & ~((above > 0) & present[:, None, None, :]).any(-1)
-    clear = (cross < 0) & (-cross > margin * torch.sqrt(ex * ex + ey * ey))
-    return (clear | ~edge).flatten(1).all(1)
+    length = torch.sqrt(ex * ex + ey * ey)
+    distance = cross - margin * length
+    inexact = (length != length.floor()) | (not centres.whole)
+    error = torch.where(inexact, ROUNDING * (reach + margin * length), 0.0)
+    sure, possible = distance > error, (distance > error) | (distance.abs() <= error) & inexact
+    return (sure | ~edge).flatten(1).all(1), (possible | ~edge).flatten(1).all(1)
 
 
 def boundary(contact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -77,30 +100,36 @@ def boundary(contact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return present, extreme(last), extreme(-first)
 
 
-def inside(contact: Tensor, com: Tensor, margin: float) -> Tensor:
-    """Return whether each ``com`` lies more than ``margin`` inside the hull of its contact.
+def inside(contact: Tensor, com: Tensor, centres: CentreTable) -> tuple[Tensor, Tensor]:
+    """Decide whether each ``com`` lies more than the margin inside the hull of its contact.
 
     Args:
         contact: bool [U, w, d], the contact cells that count.
-        com: float64 [U, 2], from the window's low corner.
-        margin: in cells, ≥ 0.
+        com: float64 [U, 2], from the window's low corner, in units of ``centres``.
+        centres: with the margin and the unit.
 
     Returns:
-        Bool [U].
+        Whether it surely does and whether it possibly does, bool [U] each.
     """
     count, w, _ = contact.shape
     present, upper, lower = boundary(contact)
     x = torch.arange(w + 1, dtype=torch.float64, device=contact.device)
-    left = torch.where(present, x, torch.inf).amin(1)
-    right = torch.where(present, x, -torch.inf).amax(1)
-    result = (com[:, 0] - left > margin) & (right - com[:, 0] > margin)
+    left = torch.where(present, x, torch.inf).amin(1) * centres.unit
+    right = torch.where(present, x, -torch.inf).amax(1) * centres.unit
+    distance = torch.minimum(com[:, 0] - left, right - com[:, 0]) - centres.margin
+    error = 0.0 if centres.whole else ROUNDING * (w * centres.unit + centres.margin)
+    sure = distance > error
+    possible = sure if centres.whole else distance >= -error
+    sure, possible = sure.clone(), possible.clone()
     mirrored = com * torch.tensor([1.0, -1.0], dtype=torch.float64, device=com.device)
-    chunk = max(1, PAIR_CELLS // (w + 1) ** (2 if margin == 0 else 3))
+    chunk = max(1, PAIR_CELLS // (w + 1) ** (2 if centres.margin == 0 else 3))
     for start in range(0, count, chunk):
         part = slice(start, start + chunk)
         for points, point in ((upper, com), (lower, mirrored)):
-            result[part] &= _below_chain(points[part].double(), present[part], point[part], margin)
-    return result
+            below = _below_chain(points[part].double(), present[part], point[part], centres)
+            sure[part] &= below[0]
+            possible[part] &= below[1]
+    return sure, possible
 
 
 def _largest_levels(
@@ -150,29 +179,36 @@ def support_mask(
     empty_map: Tensor,
     sides: Tensor,
     height: int,
-    com: Tensor | None = None,
-    margin: float = 0.0,
-) -> Tensor:
-    """Compute where each box fits and its centre of mass is supported, bool [N, A, W, D].
+    centres: CentreTable | None = None,
+) -> tuple[Tensor, Tensor | None]:
+    """Compute where each box fits and its centre of mass is supported.
 
     Args:
         heightmap: int16 [N, W, D].
         empty_map: int or bool [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H, at most 16383 cells.
-        com: float64 [N, A, 2] from the window's low corner; the middle by default.
-        margin: cells by which the support polygon is shrunk.
+        centres: of mass, with the margin; None: in the middle, without a margin.
+
+    Returns:
+        The mask, bool [N, A, W, D], and the windows int64 [U, 4] (rows n, a, x, y) that exact
+        fractions must decide; None if there are none.
     """
     assert height <= MAX_HEIGHT
     n, width, depth = heightmap.shape
     count = sides.shape[1]
     flat = sides.flatten(0, 1).long()
-    middle = flat[:, :2].double() / 2 if com is None else com.flatten(0, 1)
+    central = centres is None
+    if centres is None:
+        centres, footprint = CENTRAL, flat[:, :2]
+        low, start, middle = (footprint + 1) // 2, footprint // 2, footprint.double()
+    else:
+        tables = centres.low, centres.start, centres.at
+        low, start, middle = (centres.look_up(table, sides).flatten(0, 1) for table in tables)
     level = (2 * heightmap + (empty_map == 0).to(heightmap.dtype)).repeat_interleave(count, 0)
     inner = torch.stack((flat[:, 0].clamp(1, width), flat[:, 1].clamp(1, depth)), 1)
-    low, start = torch.ceil(middle - margin).long(), torch.floor(middle + margin).long()
     best, (a, b, c, e), halves = _largest_levels(
-        level, inner, low, start, equal=com is None and margin == 0, cover=margin == 0
+        level, inner, low, start, equal=central, cover=centres.margin == 0
     )
     limit = 2 * (height - flat[:, 2, None, None]) + 1
     within = (low > 0).all(1) & (start < flat[:, :2]).all(1)
@@ -182,8 +218,13 @@ def support_mask(
     for half in halves:
         possible &= half == best
     index, x, y = torch.nonzero(possible & ~mask, as_tuple=True)
+    unsure = None
     if index.numel():
         window, member = cut_windows(level, index, x, y, flat[index])
         contact = member & (window == best[index, x, y][:, None, None])
-        mask[index, x, y] = inside(contact, middle[index], margin)
-    return mask.view(n, count, width, depth)
+        sure, maybe = inside(contact, middle[index], centres)
+        mask[index, x, y] = sure
+        if not centres.whole or centres.margin > 0:
+            rows = torch.stack((index // count, index % count, x, y), 1)[maybe & ~sure]
+            unsure = rows if len(rows) else None
+    return mask.view(n, count, width, depth), unsure

@@ -4,33 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 
-import torch
 from torch import Tensor
 
 from marl_pack.bins import Bins
 from marl_pack.geometry import ORIENTATIONS, oriented
+from marl_pack.stability.centres import HALF, CentreTable, Offsets, centre_table, exact
 
 
 @dataclass(frozen=True)
 class OrientedItem:
-    """One item per bin in A orientations; without centre or weight, mass is uniform."""
+    """One item per bin in A orientations; without offsets or weight, mass is uniform."""
 
     sides: Tensor  # int16 [N, A, 3]  w, d, h along x, y, z; a zero side: orientation not allowed
-    com: Tensor | None = None  # float64 [N, A, 2]  centre of mass from the window's low corner
+    # for each orientation, the centre of mass from the geometric centre in fractions of w and d
+    offsets: Offsets | None = None
     weight: Tensor | None = None  # float64 [N]
 
     def __getitem__(self, index: Tensor | slice) -> OrientedItem:
         """Return the oriented items of the chosen bins."""
-        return OrientedItem(
-            self.sides[index],
-            None if self.com is None else self.com[index],
-            None if self.weight is None else self.weight[index],
-        )
+        weight = None if self.weight is None else self.weight[index]
+        return OrientedItem(self.sides[index], self.offsets, weight)
 
-    def centres(self) -> Tensor:
-        """Return the centres of mass from the window's low corner, float64 [N, A, 2]."""
-        return self.sides[..., :2].double() / 2 if self.com is None else self.com
+    def centre_table(self, margin: float, longest: int) -> CentreTable:
+        """Return the table of the centres of mass for sides up to ``longest`` cells."""
+        offsets = ((0.0, 0.0),) * self.sides.shape[1] if self.offsets is None else self.offsets
+        return centre_table(offsets, margin, longest)
+
+    def exact_centre(self, orientation: int, w: int, d: int) -> tuple[Fraction, Fraction]:
+        """Return the centre of mass from the window's low corner, for a footprint of w x d."""
+        x, y = (0.0, 0.0) if self.offsets is None else self.offsets[orientation]
+        return w * (HALF + exact(x)), d * (HALF + exact(y))
 
     def weights(self) -> Tensor:
         """Return the weight of each bin's item, float64 [N]."""
@@ -75,12 +80,7 @@ def orient_item(
         com_offset: how far the centre of mass lies from the geometric centre, as fractions of the
             item's own sides; it rotates with the item.
     """
-    sides = oriented(items)
-    if not any(com_offset):
-        return OrientedItem(sides, None, weight)
-    offsets = torch.tensor(
-        [[com_offset[axis] for axis in permutation[:2]] for permutation in ORIENTATIONS],
-        dtype=torch.float64,
-        device=items.device,
-    )
-    return OrientedItem(sides, (0.5 + offsets) * sides[..., :2], weight)
+    offsets = None
+    if any(com_offset):
+        offsets = tuple((com_offset[x], com_offset[y]) for x, y, _ in ORIENTATIONS)
+    return OrientedItem(oriented(items), offsets, weight)

@@ -1,19 +1,24 @@
 """The definition of every rule, one window at a time, in plain NumPy.
 
 Nothing here is fast. The batched code is tested cell by cell against these functions, which define
-what a rule means. A cell is a unit square, not a point:
+what a rule means. Its arithmetic is exact: a float means the decimal that is written for it, so 0.1 is
+one tenth. A cell is a unit square, not a point:
 a support polygon is the convex hull of the corners of the contact squares, and a centre of mass
 must lie strictly inside it. ``docs/environment.md`` lists where this departs from the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-Points = NDArray[np.float64]
+from marl_pack.stability.centres import exact
+
+Number = int | float | Fraction
+Point = tuple[Number, Number]
 Map = NDArray[np.integer]
 
 
@@ -30,47 +35,65 @@ def place_box(
     return z, int(gap.sum())
 
 
-def corners(cells: NDArray[np.bool_]) -> Points:
+def corners(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the corners of the unit squares of ``cells`` [w, d], as points [P, 2]."""
     xy = np.argwhere(cells)
     return np.unique(np.concatenate([xy + o for o in ((0, 0), (0, 1), (1, 0), (1, 1))]), axis=0)
 
 
-def convex_hull(points: Points) -> Points:
+def convex_hull(points: NDArray[np.int64]) -> list[Point]:
     """Return the vertices of the convex hull, counter-clockwise (Andrew's monotone chain)."""
 
-    def chain(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        out: list[tuple[float, float]] = []
+    def chain(ordered: list[Point]) -> list[Point]:
+        out: list[Point] = []
         for p in ordered:
             while len(out) > 1 and cross(out[-2], out[-1], p) <= 0:
                 out.pop()
             out.append(p)
         return out[:-1]
 
-    ordered = sorted({(float(x), float(y)) for x, y in points})
-    return np.array(chain(ordered) + chain(ordered[::-1]))
+    ordered: list[Point] = sorted({(x, y) for x, y in points.tolist()})
+    return chain(ordered) + chain(ordered[::-1])
 
 
-def cross(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+def cross(a: Point, b: Point, c: Point) -> Number:
     """Return twice the signed area of the triangle a, b, c; positive if c lies left of a → b."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def clearance(polygon: Points, point: tuple[float, float]) -> float:
-    """Return the distance of ``point`` to the polygon's boundary lines; ≤ 0 on it or outside."""
-    edges = zip(polygon, np.roll(polygon, -1, axis=0), strict=True)
-    return min(
-        cross(tuple(a), tuple(b), point) / float(np.hypot(*(b - a))) for a, b in edges
-    )  # exact in sign: coordinates are whole or half cells
+def edges(polygon: list[Point]) -> Iterator[tuple[Point, Point]]:
+    """Yield the edges of a polygon, counter-clockwise."""
+    return zip(polygon, polygon[1:] + polygon[:1], strict=True)
 
 
-def supported(cells: NDArray[np.bool_], com: tuple[float, float], margin: float) -> bool:
-    """Return whether ``com`` lies more than ``margin`` inside the hull of ``cells``' squares."""
-    return bool(cells.any()) and clearance(convex_hull(corners(cells)), com) > margin
+def deeper(polygon: list[Point], point: Point, margin: Number) -> bool:
+    """Return whether ``point`` lies more than ``margin`` inside every edge of the polygon."""
+    for a, b in edges(polygon):
+        area = cross(a, b, point)
+        squared_length = (b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2
+        if area <= 0 or area**2 <= margin**2 * squared_length:
+            return False
+    return True
+
+
+def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
+    """Return whether ``com`` lies more than ``margin`` inside the hull of ``cells``' squares.
+
+    The arithmetic is that of Python's whole numbers and fractions, so it is exact.
+
+    Args:
+        cells: bool [w, d].
+        com: the centre of mass from the low corner of ``cells``; floats mean their decimals.
+        margin: cells, ≥ 0; a float means its decimal.
+    """
+    if not cells.any():
+        return False
+    point = exact(com[0]), exact(com[1])
+    return deeper(convex_hull(corners(cells)), point, exact(margin))
 
 
 def hull(
-    heights: Map, bearing: NDArray[np.bool_], com: tuple[float, float], margin: float = 0.0
+    heights: Map, bearing: NDArray[np.bool_], com: Point, margin: Number = 0
 ) -> bool:
     """Return the verdict of ``hull_1``, ``hull_alpha`` and ``lbcp`` on one window.
 
@@ -80,12 +103,13 @@ def hull(
     return supported((heights == heights.max()) & bearing, com, margin)
 
 
-def area_ratio(heights: Map, thresholds: tuple[tuple[float, int], ...]) -> bool:
+def area_ratio(heights: Map, thresholds: tuple[tuple[Number, int], ...]) -> bool:
     """Return the verdict of Zhao et al. 2021 by the supported share and corners of the bottom."""
     contact = heights == heights.max()
     count = int(contact[[0, 0, -1, -1], [0, -1, 0, -1]].sum())
     return any(
-        contact.sum() > share * contact.size and count >= corners for share, corners in thresholds
+        int(contact.sum()) > exact(share) * contact.size and count >= corners
+        for share, corners in thresholds
     )
 
 
@@ -102,11 +126,11 @@ def lbcp_bearing(size: tuple[int, int], boxes: Map) -> NDArray[np.bool_]:
         window = np.s_[x : x + w, y : y + d]
         cells = (heightmap[window] == z) & bearing[window]
         if cells.any():
-            polygon = convex_hull(corners(cells))
+            sides = list(edges(convex_hull(corners(cells))))
             for i in range(w):
                 for j in range(d):
                     square = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)]
-                    cells[i, j] = all(clearance(polygon, p) >= 0 for p in square)
+                    cells[i, j] = all(cross(*edge, p) >= 0 for edge in sides for p in square)
         bearing[window] = cells
         place_box(heightmap, empty_map, (x, y), (w, d, h))
     return bearing

@@ -9,11 +9,12 @@ from functools import partial
 from numbers import Real
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from marl_pack.bins import Bins
-from marl_pack.stability import hull_compiled, hull_tensor, support_area
+from marl_pack.stability import hull_compiled, hull_tensor, reference, support_area
 from marl_pack.stability.equilibrium_masks import equilibrium_mask
 from marl_pack.stability.load_bearing import lbcp_bearing
 from marl_pack.stability.oriented_item import OrientedItem, Rule
@@ -21,8 +22,18 @@ from marl_pack.stability.oriented_item import OrientedItem, Rule
 
 def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float) -> Tensor:
     """Return the convex-hull mask in which only columns with ``empty_map`` 0 count as support."""
+    centres = None
+    if item.offsets is not None or margin > 0:
+        centres = item.centre_table(margin, max(bins.size[:2]))
     code = bins.backend.pick(compiled=hull_compiled.support_mask, tensor=hull_tensor.support_mask)
-    return code(bins.heightmap, empty_map, item.sides, bins.height, item.com, margin)
+    mask, unsure = code(bins.heightmap, empty_map, item.sides, bins.height, centres)
+    for n, a, x, y in [] if unsure is None else unsure.tolist():
+        w, d, _ = item.sides[n, a].tolist()
+        window = np.s_[n, x : x + w, y : y + d]
+        heights, bearing = bins.heightmap[window].cpu().numpy(), empty_map[window].cpu() == 0
+        com = item.exact_centre(a, w, d)
+        mask[n, a, x, y] = reference.hull(heights, bearing.numpy(), com, margin)
+    return mask
 
 
 def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
+from marl_pack.stability.centres import exact
 
 Thresholds = tuple[tuple[float, int], ...]
 
@@ -27,9 +28,13 @@ THRESHOLDS = {"paper": PAPER, "code": CODE}
 
 @njit(cache=True, nogil=True)
 def _fill_masks(
-    heightmap: Any, sides: Any, height: int, share: Any, corners: Any, out: Any
+    heightmap: Any, sides: Any, height: int, fewest: Any, corners: Any, out: Any
 ) -> None:
-    """Write the masks uint8 [N, A, W, D] for thresholds given as shares and corners."""
+    """Write the masks uint8 [N, A, W, D].
+
+    ``fewest`` int64 [N, A, T]: supported cells that each of T thresholds needs, with its
+    ``corners`` int64 [T].
+    """
     n, width, depth = heightmap.shape
     cells = width * depth
     buffers = np.empty((2, cells), heightmap.dtype)
@@ -54,20 +59,37 @@ def _fill_masks(
                     int(window[0, 0] == z) + int(window[0, d - 1] == z)
                     + int(window[w - 1, 0] == z) + int(window[w - 1, d - 1] == z)
                 )  # fmt: skip
-                needed = 2.0
-                for k in range(share.size):
+                needed = np.int64(w) * d + 1
+                for k in range(corners.size):
                     if supported >= corners[k]:
-                        needed = min(needed, share[k])
-                spare = w * d - needed * (w * d)  # stands if fewer cells than this are missing
+                        needed = min(needed, fewest[b, a, k])
+                spare = w * d - needed  # cells that may be missing
                 missing = 0
                 for x in range(w):
                     row = 0
                     for y in range(d):
                         row += window[x, y] != z
                     missing += row
-                    if missing >= spare:
+                    if missing > spare:
                         break
-                mask[i] = w * d - missing > needed * (w * d)
+                mask[i] = missing <= spare
+
+
+def _fewest_cells(sides: Tensor, thresholds: Thresholds) -> Tensor:
+    """Compute how many supported cells exceed the share of each threshold, int64 [N, A, T].
+
+    The arithmetic is exact: 60 % of 5 cells are 3 cells, so 4 exceed them.
+    """
+    faces = sides[..., 0].long() * sides[..., 1].long()
+    columns = []
+    for share, _ in thresholds:
+        part = exact(share)
+        if max(part.numerator, part.denominator) < 1 << 32:  # a face has less than 2^30 cells
+            columns.append(faces * part.numerator // part.denominator + 1)
+        else:
+            cells = [face * part.numerator // part.denominator + 1 for face in faces.view(-1).tolist()]
+            columns.append(torch.tensor(cells, device=faces.device).view(faces.shape))
+    return torch.stack(columns, -1)
 
 
 def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
@@ -83,10 +105,9 @@ def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thr
         Bool [N, A, W, D].
     """
     out = np.empty((*sides.shape[:2], *heightmap.shape[1:]), np.uint8)
-    share = np.array([t[0] for t in thresholds])
     corners = np.array([t[1] for t in thresholds])
     heights, boxes = (np.ascontiguousarray(values.numpy()) for values in (heightmap, sides))
-    _fill_masks(heights, boxes, height, share, corners, out)
+    _fill_masks(heights, boxes, height, _fewest_cells(sides, thresholds).numpy(), corners, out)
     return torch.from_numpy(out.view(np.bool_))
 
 
@@ -115,10 +136,10 @@ def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thres
         (heightmap[b, cx, cy] == z).long()
         for cx, cy in ((x, y), (x, last_y), (last_x, y), (last_x, last_y))
     )
-    face = (w * d).double()
+    fewest = _fewest_cells(sides, thresholds)[:, :, None, None]
     stands = torch.zeros_like(possible)
-    for share, corners in thresholds:
-        stands |= (area > share * face) & (supported >= corners)
+    for k, (_, corners) in enumerate(thresholds):
+        stands |= (area >= fewest[..., k]) & (supported >= corners)
     return possible & stands
 
 

@@ -348,7 +348,7 @@ def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -
         box, heightmap, empty_map = sides[b, a], bins.heightmap[b], bins.empty_map[b]
         under = footprint(width, depth, box, part[:, 2:])
         waste.append(place_boxes(heightmap, empty_map, under, box[:, 2])[1])
-        legal = hull_tensor.support_mask(
+        legal, _ = hull_tensor.support_mask(
             heightmap, empty_map, boxes.expand(len(part), -1, -1).contiguous(), height
         )
         counts.append(legal.sum((2, 3), dtype=torch.int32))

@@ -1,0 +1,95 @@
+"""Centres of mass and margins as exact numbers, in tables that fast code can use.
+
+A decimal that a user writes means that decimal: 0.1 is one tenth, though no float64 is. A centre of
+mass may lie exactly on the edge of its support, where the least rounding error would decide.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Offsets = tuple[tuple[float, float], ...]
+"""For each of A orientations, the centre of mass from the geometric centre along x and y, in
+fractions of the item's sides as oriented."""
+
+HALF = Fraction(1, 2)
+
+LARGEST_WHOLE = 2.0**53
+"""Whole numbers up to this one are exact in float64."""
+
+
+def exact(value: float | Fraction) -> Fraction:
+    """Return a number as a fraction; a float means its shortest decimal, as ``str`` writes it.
+
+    Raises:
+        ValueError: for NaN and infinity.
+    """
+    return value if isinstance(value, Fraction) else Fraction(str(value))
+
+
+@dataclass(frozen=True)
+class CentreTable:
+    """Where centres of mass lie, for A orientations, both axes and every side from 0 to L.
+
+    Coordinates count from the window's low corner in units of 1 / ``unit`` cells.
+    """
+
+    at: NDArray[np.float64]  # [A, 2, L + 1]  the centre of mass
+    # int64 [A, 2, L + 1]: cells that begin below the centre of mass by more than the margin
+    low: NDArray[np.int64]
+    # int64 [A, 2, L + 1]: first cell that ends above the centre of mass by more than the margin
+    start: NDArray[np.int64]
+    unit: float  # units in a cell
+    margin: float  # in units
+    whole: bool  # all coordinates and the margin are whole numbers: float64 is exact on them
+
+    def cells(self, sides: Tensor) -> Tensor:
+        """Return the centres in cells, float64 [N, A, 2], of items with ``sides`` [N, A, 3]."""
+        return self.units(sides) / self.unit
+
+    def units(self, sides: Tensor) -> Tensor:
+        """Return the centres in units, float64 [N, A, 2], of items with ``sides`` [N, A, 3]."""
+        return self.look_up(self.at, sides)
+
+    @staticmethod
+    def look_up(table: NDArray[np.generic], sides: Tensor) -> Tensor:
+        """Return the entries of a table [A, 2, L + 1] for the sides w, d of ``sides`` [N, A, 3]."""
+        entries = torch.from_numpy(table).to(sides.device)
+        index = sides[..., :2].long().clamp(max=entries.shape[2] - 1)
+        return entries.expand(len(sides), -1, -1, -1).gather(3, index[..., None]).squeeze(3)
+
+
+@lru_cache(maxsize=64)
+def centre_table(offsets: Offsets, margin: float, longest: int) -> CentreTable:
+    """Compute the table of centres of mass, all of it in exact arithmetic.
+
+    Args:
+        offsets: for each orientation; decimals mean what they say.
+        margin: cells by which the support polygon is shrunk; a decimal means what it says.
+        longest: L, the longest side that a window may have.
+    """
+    shares = [[HALF + exact(offset) for offset in pair] for pair in offsets]
+    exact_margin = exact(margin)
+    denominators = [share.denominator for pair in shares for share in pair]
+    unit = math.lcm(*denominators, exact_margin.denominator)
+    # The tests multiply coordinates with differences of cells, and add two such products.
+    whole = 4 * unit * (longest + 1) ** 2 <= LARGEST_WHOLE
+    unit = unit if whole else 1
+    shape = (len(offsets), 2, longest + 1)
+    at, low, start = np.empty(shape), np.empty(shape, np.int64), np.empty(shape, np.int64)
+    for a, pair in enumerate(shares):
+        for axis, share in enumerate(pair):
+            for side in range(longest + 1):
+                centre = side * share
+                at[a, axis, side] = float(centre * unit)
+                low[a, axis, side] = math.ceil(centre - exact_margin)
+                start[a, axis, side] = math.floor(centre + exact_margin)
+    return CentreTable(at, low, start, float(unit), float(exact_margin * unit), whole)
