@@ -78,11 +78,16 @@ def some_items(n: int, sides: tuple[int, int], seed: int) -> Tensor:
 
 
 def off_centre(items: Tensor, seed: int) -> OrientedItem:
-    """OrientedItem with a centre of mass anywhere in the middle half of each footprint."""
-    generator = torch.Generator().manual_seed(seed)
-    sides = oriented(items)
-    share = 0.25 + 0.5 * torch.rand(*sides.shape[:2], 2, generator=generator, dtype=torch.float64)
-    return OrientedItem(sides, share * sides[..., :2])
+    """OrientedItem whose centres of mass lie in the middle half of each footprint.
+
+    Offsets are decimals of one to three places, and one of 17 digits.
+    """
+    generator = np.random.default_rng(seed)
+    pairs = [
+        tuple(round(float(offset), 1 + a % 3) for offset in generator.uniform(-0.25, 0.25, 2))
+        for a in range(5)
+    ]
+    return OrientedItem(oriented(items), (*pairs, (1 / 6, -1 / 12)))
 
 
 def in_play(n: int, steps: int, **settings: object) -> Packing:

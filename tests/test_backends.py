@@ -155,7 +155,7 @@ def test_hull_masks_equal_the_reference(
 
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
         window = np.s_[b, x : x + w, y : y + d]
-        centre = tuple(item.centres()[b, a].tolist())
+        centre = item.exact_centre(a, w, d)
         return reference.hull(bins.heightmap.numpy()[window], bearing[window], centre, margin)
 
     mask = make_rule(rule, margin=margin)(bins, item)

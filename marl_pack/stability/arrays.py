@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.backend import default_backend
 from marl_pack.bins import UNKNOWN, Bins
+from marl_pack.checks import real_number, shown
 from marl_pack.geometry import check_size
 from marl_pack.geometry.compiled import place_box
 from marl_pack.stability.oriented_item import NO_OFFSET, OrientedItem, Rule, check_com_offset
 from marl_pack.stability.rules import equilibrium, lbcp, make_rule
-from marl_pack.stability.static_equilibrium import uniform_loads
+from marl_pack.stability.static_equilibrium import check_boxes, uniform_loads, whole_cells
 
 
 def stable_mask(
@@ -55,8 +56,12 @@ def stable_mask(
     sides = _check_item(item)
     bound = _bind(rule, parameters, with_boxes=boxes is not None or not heights.any())
     stack, load = _stack(boxes, weights, heights, empty)
-    if weight is not None and not 0 < weight < float("inf"):
-        raise ValueError(f"weight {weight!r}: needs a positive number")
+    own_weight = None
+    if weight is not None:
+        own_weight = torch.tensor([_check_weight(weight)], dtype=torch.float64)
+    offset = check_com_offset(com_offset)
+    if (sides > (*heights.shape, bin_height)).any():
+        return np.zeros(heights.shape, np.bool_)
     bins = Bins(
         heightmap=torch.from_numpy(heights.astype(np.int16))[None],
         empty_map=torch.from_numpy(empty.astype(np.int16))[None],
@@ -68,28 +73,24 @@ def stable_mask(
         height=int(bin_height),
         backend=default_backend("cpu"),
     )
-    offset = check_com_offset(com_offset)
-    com = (0.5 + torch.tensor(offset[:2], dtype=torch.float64)) * torch.from_numpy(sides[:2])
-    clipped = np.minimum(sides, np.iinfo(np.int16).max).astype(np.int16)
     oriented = OrientedItem(
-        torch.from_numpy(clipped)[None, None],
-        com[None, None] if any(offset[:2]) else None,
-        None if weight is None else torch.tensor([float(weight)]),
+        torch.from_numpy(sides.astype(np.int16))[None, None],
+        (offset[:2],) if any(offset[:2]) else None,
+        own_weight,
     )
     return bound(bins, oriented)[0, 0].numpy()
 
 
-def _whole(name: str, values: ArrayLike) -> NDArray[np.int64]:
-    """Return ``values`` as whole numbers, int64.
+def _check_weight(weight: float) -> float:
+    """Return a weight as a float.
 
     Raises:
-        ValueError: if one is not a whole number.
+        ValueError: unless it is a finite number above 0.
     """
-    array = np.asarray(values)
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all() or (array % 1 != 0).any():
-        raise ValueError(f"{name}: needs whole numbers of cells, got {array.dtype} values with a"
-                         " fraction, NaN or another type")  # fmt: skip
-    return array.astype(np.int64)
+    number = real_number(weight, "weight")
+    if number <= 0:
+        raise ValueError(f"weight: needs a number above 0, not {shown(weight)}")
+    return number
 
 
 def _check_item(item: ArrayLike) -> NDArray[np.int64]:
@@ -98,7 +99,7 @@ def _check_item(item: ArrayLike) -> NDArray[np.int64]:
     Raises:
         ValueError: unless they are three whole numbers of cells ≥ 1.
     """
-    sides = _whole("item", item)
+    sides = whole_cells("item", item)
     if sides.shape != (3,) or sides.min() < 1:
         raise ValueError(f"item {item!r}: needs three whole sides w, d, h ≥ 1 in cells")
     return sides
@@ -112,7 +113,8 @@ def _check_maps(
     Raises:
         ValueError: if their shapes differ, or a number in them or the bin's size is impossible.
     """
-    heights, empty = _whole("heightmap", heightmap), _whole("empty_map", empty_map)
+    heights = whole_cells("heightmap", heightmap)
+    empty = whole_cells("empty_map", empty_map)
     if heights.ndim != 2 or heights.shape != empty.shape:
         raise ValueError(
             f"heightmap {heights.shape} and empty_map {empty.shape}: need the same shape [W, D]"
@@ -120,8 +122,8 @@ def _check_maps(
     check_size((*heights.shape, bin_height))
     if heights.min() < 0 or heights.max() > bin_height:
         raise ValueError(f"heightmap: heights must lie in 0 … {bin_height}, the bin's height")
-    if empty.min() < 0 or (empty > heights).any():
-        raise ValueError("empty_map: must lie between 0 and the column's height")
+    if empty.min() < 0 or (empty > np.maximum(heights - 1, 0)).any():
+        raise ValueError("empty_map: must lie between 0 and the column's height less its top cell")
     return heights, empty
 
 
@@ -141,6 +143,8 @@ def _bind(
     bound: Callable[..., torch.Tensor]
     if isinstance(rule, str):
         bound = make_rule(rule, **parameters)
+    elif not callable(rule):
+        raise ValueError(f"rule {rule!r}: needs a name in RULES or a rule from make_rule")
     elif parameters:
         raise ValueError(f"{sorted(parameters)}: need the name of a rule, not a bound one")
     else:
@@ -169,7 +173,7 @@ def _stack(
         if weights is not None:
             raise ValueError("weights: need boxes")
         return np.zeros((0, 6), np.int64), np.zeros((0, 3))
-    stack = _whole("boxes", boxes).reshape(-1, 6) if np.size(boxes) else np.zeros((0, 6), np.int64)
+    stack = check_boxes(boxes)
     order = np.argsort(stack[:, 2], kind="stable")
     stack = stack[order]
     heightmap, empty_map = np.zeros_like(heights), np.zeros_like(heights)
@@ -185,9 +189,8 @@ def _stack(
         raise ValueError("boxes: need to make this heightmap and empty_map")
     load = uniform_loads(stack)
     if weights is not None:
-        own_weights = np.asarray(weights, np.float64)
-        positive = np.isfinite(own_weights) & (own_weights > 0)
-        if own_weights.shape != (len(stack),) or not positive.all():
-            raise ValueError(f"weights: needs one positive number a box, {len(stack)}")
-        load[:, 0] = own_weights[order]
+        own_weights = np.asarray(weights)
+        if own_weights.shape != (len(stack),):
+            raise ValueError(f"weights: needs one number a box, {len(stack)}")
+        load[:, 0] = [_check_weight(own_weights[row]) for row in order]
     return stack, load

@@ -2,21 +2,23 @@
 
 Where ``hull_alpha`` is true, the stack stands: the new weight goes straight down through filled
 columns. Where ``hull_1`` is false, it does not: the box itself tips. Only the other cells are
-solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Where its
-simplex is unsure, HiGHS decides (:mod:`marl_pack.stability.static_equilibrium`).
+solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`, and near a
+tie by the same program in whole numbers.
 """
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
-from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_pack.bins import Bins
+from marl_pack.stability.centres import exact
+from marl_pack.stability.exact_equilibrium import Load
 from marl_pack.stability.oriented_item import OrientedItem
 from marl_pack.stability.reduced_equilibrium import (
     UNSURE,
@@ -24,12 +26,14 @@ from marl_pack.stability.reduced_equilibrium import (
     ground_points,
     mark_bearing,
     stands,
+    stands_by_fractions,
     survey,
 )
 from marl_pack.stability.static_equilibrium import in_equilibrium
 
-DIRECTIONS = 16
-"""Corners of the polygon drawn around the disc of radius ``margin`` (2 % on the safe side)."""
+CORNERS = ((1020, 0), (942, 391), (721, 721), (391, 942))
+"""Corners, in thousandths of the margin, of a polygon around the disc of that radius: these, and
+the same rotated by quarters. It is 2 % on the safe side."""
 
 
 @njit(cache=True, nogil=True)
@@ -112,40 +116,52 @@ def equilibrium_mask(
     band = possibly & ~sure
     if not bool(band.any()):
         return sure
-    shifts = np.zeros((1, 2))
-    if margin > 0:
-        angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-        shifts = margin / np.cos(np.pi / DIRECTIONS) * np.stack((np.cos(angle), np.sin(angle)), 1)
+    exact_shifts = _shifts(margin)
+    shifts = np.array(exact_shifts, np.float64)
     verdict = np.zeros(tuple(band.shape), np.uint8)
+    centres = item.centre_table(0.0, max(bins.size[:2]))
     inputs = (
         stack.heightmap, stack.empty_map, stack.boxes, stack.loads, stack.count,
-        item.sides, item.centres(), item.weights(),
+        item.sides, centres.cells(item.sides), item.weights(),
         torch.from_numpy(shifts), torch.from_numpy(whole), band,
     )  # fmt: skip
     _solve_band(*(tensor.cpu().contiguous().numpy() for tensor in inputs), verdict)
     for b, a, x, y in np.argwhere(verdict == UNSURE).tolist():
-        verdict[b, a, x, y] = _stands_by_highs(stack, item, b, a, x, y, shifts)
+        verdict[b, a, x, y] = _stands_exactly(stack, item, (b, a, x, y), exact_shifts, whole[b])
     return sure | torch.from_numpy(verdict == YES).to(device)
 
 
-def _stands_by_highs(
+def _shifts(margin: float) -> list[tuple[Fraction, Fraction]]:
+    """Return the shifts of a centre of mass that it must bear, exact numbers of cells."""
+    if margin == 0:
+        return [(Fraction(0), Fraction(0))]
+    scale = exact(margin) / 1000
+    shifts = []
+    for x, y in CORNERS:
+        for corner in ((x, y), (-y, x), (-x, -y), (y, -x)):
+            shifts.append((scale * corner[0], scale * corner[1]))
+    return shifts
+
+
+def _stands_exactly(
     stack: Bins,
     item: OrientedItem,
-    b: int,
-    a: int,
-    x: int,
-    y: int,
-    shifts: NDArray[np.float64],
+    cell: tuple[int, int, int, int],
+    shifts: list[tuple[Fraction, Fraction]],
+    whole: bool,
 ) -> bool:
-    """Decide one cell by HiGHS, with the linear program of the whole stack."""
+    """Decide one cell (b, a, x, y) in exact arithmetic."""
+    b, a, x, y = cell
     k = int(stack.count[b])
     w, d, h = item.sides[b, a].tolist()
     z = int(stack.heightmap[b, x : x + w, y : y + d].max())
-    boxes = np.vstack((stack.boxes[b, :k].numpy(), (x, y, z, w, d, h)))
-    corner = np.array((x, y))
-    centre = corner + item.centres()[b, a].cpu().numpy()
-    weight = float(item.weights()[b])
-    loads = [
-        np.vstack((stack.loads[b, :k].numpy(), (weight, *(centre + shift)))) for shift in shifts
-    ]
-    return all(in_equilibrium(boxes, load) for load in loads)
+    boxes = np.vstack((stack.boxes[b, :k].numpy(), (x, y, z, w, d, h))).astype(np.int64)
+    loads = [Load(*map(exact, row)) for row in stack.loads[b, :k].tolist()]
+    weight = exact(float(item.weights()[b]))
+    com = item.exact_centre(a, w, d)
+    return all(
+        stands_by_fractions(
+            boxes, [*loads, Load(weight, x + com[0] + dx, y + com[1] + dy)], stack.size[:2], whole
+        )
+        for dx, dy in shifts
+    )

@@ -18,20 +18,23 @@ asks thousands of such questions about stacks that stand, so the program is redu
   the balance they had: the cone is a product.
 
 What remains (a handful of boxes) goes to a small dense simplex, whose forces are put back into the
-equations; where they do not confirm its verdict, it is UNSURE.
+equations. Where they do not confirm its verdict, or it is nearly a tie, it is UNSURE, and the same
+program is solved in whole numbers (:func:`stands_by_fractions`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from marl_pack.geometry.compiled import place_box
+from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 from marl_pack.stability.hull_exact import envelope, row_extremes
-from marl_pack.stability.simplex import max_least_force
-from marl_pack.stability.static_equilibrium import STRICT
+from marl_pack.stability.simplex import NEAR, max_least_force
 
 NO, YES, UNSURE = 0, 1, 2
 
@@ -231,11 +234,42 @@ def stands(
         whole: whether to solve all ungrounded boxes, not only those that the new one may disturb.
 
     Returns:
-        NO, YES or UNSURE, where the simplex cannot be trusted.
+        NO, YES or UNSURE, where the simplex cannot be trusted or it is nearly a tie.
     """
     members, row, forces = _component(boxes, n, grounded, count, whole)
     a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
-    force, reliable = max_least_force(a, weight, 1e3 * STRICT)
-    if not reliable:
+    force, reliable, _ = max_least_force(a, weight, 10 * NEAR)
+    if not reliable or abs(force) <= NEAR:
         return UNSURE
-    return YES if force > STRICT else NO
+    return YES if force > 0 else NO
+
+
+def stands_by_fractions(
+    boxes: NDArray[np.int64], loads: Sequence[Load], shape: tuple[int, int], whole: bool
+) -> bool:
+    """Decide in exact arithmetic what :func:`stands` decides.
+
+    Args:
+        boxes: int64 [n + 1, 6], rows x, y, z, w, d, h in order of placement; the last one is new.
+        loads: of these boxes.
+        shape: (W, D).
+        whole: as for :func:`stands`.
+    """
+    n = len(boxes) - 1
+    scratch = np.empty((3, 2 * shape[0] + 2, 2), np.int64)
+    grounded, points, count = survey(boxes, n + 1, shape, scratch)
+    if grounded[n]:  # its centre of mass lies inside its own footprint, all of which bears
+        grounded[n], count[n] = False, 4
+        w, d = boxes[n, 3:5]
+        points[n, :4] = (0, 0), (0, d), (w, 0), (w, d)
+    members, row, _ = _component(boxes, n, grounded[: n + 1], count[: n + 1], whole)
+    forces = []
+    for i in members.tolist():
+        for x, y in (boxes[i, :2] + points[i, : count[i]]).astype(np.int64).tolist():
+            forces.append(Force(x, y, int(row[i]), GROUND))
+        for j in np.flatnonzero(~grounded[: n + 1]).tolist():
+            if j != i and _touches(boxes[i], boxes[j]):
+                x0, y0, x1, y1 = map(int, _overlap(boxes[i], boxes[j]))
+                for x, y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
+                    forces.append(Force(x, y, int(row[i]), int(row[j])))
+    return stands_exactly([loads[i] for i in members.tolist()], forces)

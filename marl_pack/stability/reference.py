@@ -1,15 +1,16 @@
 """The definition of every rule, one window at a time, in plain NumPy.
 
 Nothing here is fast. The batched code is tested cell by cell against these functions, which define
-what a rule means. Its arithmetic is exact: a float means the decimal that is written for it, so 0.1 is
-one tenth. A cell is a unit square, not a point:
-a support polygon is the convex hull of the corners of the contact squares, and a centre of mass
-must lie strictly inside it. ``docs/environment.md`` lists where this departs from the paper.
+what a rule means. The arithmetic is exact: a float means the decimal that is written for it, so 0.1
+is one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the
+corners of the contact squares, and a centre of mass must lie strictly inside it.
+``docs/environment.md`` lists where this departs from the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -92,9 +93,7 @@ def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
     return deeper(convex_hull(corners(cells)), point, exact(margin))
 
 
-def hull(
-    heights: Map, bearing: NDArray[np.bool_], com: Point, margin: Number = 0
-) -> bool:
+def hull(heights: Map, bearing: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
     """Return the verdict of ``hull_1``, ``hull_alpha`` and ``lbcp`` on one window.
 
     Only contact cells in ``bearing`` count. It is all true for hull_1 (the paper's p_f),
@@ -147,3 +146,89 @@ def window_mask(
             window = heightmap[x : x + w, y : y + d]
             mask[x, y] = window.max() + h <= bin_height and stands(x, y)
     return mask
+
+
+def equilibrium(boxes: Map, loads: Sequence[tuple[Number, Number, Number]]) -> bool:
+    """Return whether a whole stack is in strict static equilibrium (Wang & Hauser 2021).
+
+    A stack is iff forces at the corners of all contacts balance its weights, and all of them are
+    positive. The textbook simplex method finds, in fractions, the largest force that all of them
+    may have. It is slow: for a few boxes.
+
+    Args:
+        boxes: whole numbers [n, 6], rows x, y, z, w, d, h.
+        loads: weight and x, y of the centre of mass of each box; floats mean their decimals.
+    """
+    rows = [[int(value) for value in row] for row in boxes]
+    centres = [tuple(map(exact, load)) for load in loads]
+    columns: list[dict[int, Fraction]] = []  # one for each force: equation → coefficient
+    for i, (x, y, z, w, d, _) in enumerate(rows):
+        supports = [(j, *rows[j]) for j in range(len(rows)) if rows[j][2] + rows[j][5] == z]
+        floor = [(-1, x, y, 0, w, d, 0)] if z == 0 else []
+        for j, bx, by, _, bw, bd, _ in supports + floor:
+            xs, ys = (max(x, bx), min(x + w, bx + bw)), (max(y, by), min(y + d, by + bd))
+            if xs[0] >= xs[1] or ys[0] >= ys[1]:
+                continue
+            for px, py in itertools.product(xs, ys):
+                column: dict[int, Fraction] = {}
+                for box, sign in ((i, 1), (j, -1)):
+                    if box >= 0:
+                        arms = Fraction(1), px - centres[box][1], py - centres[box][2]
+                        column |= {3 * box + k: sign * arm for k, arm in enumerate(arms)}
+                columns.append(column)
+    equations = range(3 * len(rows))
+    a = [[column.get(r, Fraction(0)) for column in columns] for r in equations]
+    weights = [centres[r // 3][0] if r % 3 == 0 else Fraction(0) for r in equations]
+    return _largest_least_force(a, weights) > 0
+
+
+def _largest_least_force(a: list[list[Fraction]], weights: list[Fraction]) -> Fraction:
+    """Solve ``max t, a f = weights, f ≥ t``; return 0 where no ``f ≥ 0`` solves it.
+
+    Two phases of the simplex method with Bland's rule. The variables are f - t, t, and an error
+    for each equation.
+    """
+    m, n = len(a), len(a[0]) if a else 0
+    errors = [[Fraction(int(i == r)) for i in range(m)] for r in range(m)]
+    table = [[*a[r], sum(a[r], Fraction(0)), *errors[r], weights[r]] for r in range(m)]
+    basis = [n + 1 + r for r in range(m)]
+    _minimise(table, basis, [0] * (n + 1) + [1] * m)
+    if any(table[r][-1] != 0 for r in range(m) if basis[r] > n):
+        return Fraction(0)
+    for r in range(m):
+        if basis[r] > n:
+            entering = next((j for j in range(n + 1) if table[r][j] != 0), None)
+            if entering is None:
+                return Fraction(0)  # some small shift of the weights cannot be balanced
+            _eliminate(table, basis, r, entering)
+    _minimise(table, basis, [0] * n + [-1])
+    return next((table[r][-1] for r in range(m) if basis[r] == n), Fraction(0))
+
+
+def _minimise(table: list[list[Fraction]], basis: list[int], costs: list[int]) -> None:
+    """Minimise the costs of the first variables from a feasible basis, in place."""
+    rows = range(len(basis))
+    while True:
+        basic = [costs[j] if j < len(costs) else 0 for j in basis]
+        reduced = (
+            costs[j] - sum(basic[r] * table[r][j] for r in rows if basic[r])
+            for j in range(len(costs))
+        )
+        entering = next((j for j, cost in enumerate(reduced) if cost < 0), None)
+        if entering is None:
+            return
+        ratios = [
+            (table[r][-1] / table[r][entering], basis[r], r) for r in rows if table[r][entering] > 0
+        ]
+        _eliminate(table, basis, min(ratios)[2], entering)
+
+
+def _eliminate(table: list[list[Fraction]], basis: list[int], row: int, column: int) -> None:
+    """Bring a column into the basis: make it a unit vector with its one in ``row``."""
+    basis[row] = column
+    pivot = table[row][column]
+    table[row] = [value / pivot for value in table[row]]
+    for r, other in enumerate(table):
+        factor = other[column]
+        if r != row and factor != 0:
+            table[r] = [x - factor * y for x, y in zip(other, table[row], strict=True)]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable
 from functools import partial
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,8 @@ import torch
 from torch import Tensor
 
 from marl_pack.bins import Bins
+from marl_pack.checks import real_number
+from marl_pack.geometry import MAX_SIDE
 from marl_pack.stability import hull_compiled, hull_tensor, reference, support_area
 from marl_pack.stability.equilibrium_masks import equilibrium_mask
 from marl_pack.stability.load_bearing import lbcp_bearing
@@ -134,10 +134,11 @@ def make_rule(name: str, **parameters: object) -> Rule:
     for key in parameters:
         if key not in accepted:
             raise ValueError(f"rule {name!r} has no parameter {key!r}: needs one of {accepted}")
-    margin: Any = parameters.get("margin", 0.0)
-    number = not isinstance(margin, bool) and isinstance(margin, Real)
-    if not number or not 0 <= margin < math.inf:
-        raise ValueError(f"margin {margin!r}: needs a number of cells ≥ 0")
+    margin = real_number(parameters.get("margin", 0.0), "margin")
+    if not 0 <= margin <= MAX_SIDE:
+        raise ValueError(f"margin {margin!r}: needs a number of cells from 0 to {MAX_SIDE}")
+    if not isinstance(parameters.get("check_stack", False), bool):
+        raise ValueError(f"check_stack {parameters['check_stack']!r}: needs true or false")
     if name == "area_ratio":
         thresholds: Any = parameters.get("thresholds", "paper")
         parameters["thresholds"] = support_area.check_thresholds(thresholds)

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+NEAR = 1e-6
+"""Least force, or least error of the equations, in mean weights, above which float64 decides."""
+
 
 @njit(cache=True)
 def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
@@ -32,7 +35,7 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     largest pivot, which keeps the numbers accurate; Bland's rule once that might cycle.
 
     Returns:
-        Whether it ended within the limit on iterations.
+        Whether it ended as it should, within the limit on iterations.
     """
     rows = basis.size
     for iteration in range(200 * rows + 1000):
@@ -60,8 +63,8 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
                     better = tied and pivot > table[row, column]
                 if ratio < best - 1e-13 or better:
                     row, best = i, ratio
-        if row < 0:
-            return True
+        if row < 0:  # forces are bounded by the weights: only rounding errors end up here
+            return False
         _pivot(table, basis, row, column)
     return False
 
@@ -91,7 +94,7 @@ def _solution(table: Any, basis: Any, a: Any, weight: Any) -> tuple[float, float
 
 
 @njit(cache=True)
-def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
+def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool, Any]:
     """Solve the linear program ``max t, a f = weight, f ≥ t``.
 
     Args:
@@ -100,9 +103,10 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
         enough: a value of t at which the search may stop.
 
     Returns:
-        The optimum, or the first value above ``enough``; -inf if no ``f ≥ 0`` solves it. And
-        whether the forces, put back into the equations, confirm it: false where rounding errors
-        have corrupted the tableau.
+        The optimum, or the first value above ``enough``; where no ``f ≥ 0`` solves it, minus the
+        least sum of the equations' errors. And whether the forces, put back into the equations,
+        confirm it: false where rounding errors have corrupted the tableau. And the basis int64 [R]:
+        columns of a, m for t, or m + 1 + r for the error of equation r.
     """
     rows, columns = a.shape
     table = np.zeros((rows + 1, columns + 2))  # g, t, right-hand side; objective in the last row
@@ -137,5 +141,5 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool]:
         missing = 0.0
 
     t, lacking, least = _solution(table, basis, a, weight)
-    reliable = reliable and abs(lacking - missing) < 1e-7 and least > -1e-9
-    return (t if feasible else -np.inf), reliable
+    reliable = reliable and abs(lacking - missing) < 1e-9 and least > -1e-9
+    return (t if feasible else -missing), reliable, basis

@@ -12,6 +12,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from marl_pack.checks import real_number, shown, whole_number
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
 from marl_pack.stability.centres import exact
@@ -87,7 +88,9 @@ def _fewest_cells(sides: Tensor, thresholds: Thresholds) -> Tensor:
         if max(part.numerator, part.denominator) < 1 << 32:  # a face has less than 2^30 cells
             columns.append(faces * part.numerator // part.denominator + 1)
         else:
-            cells = [face * part.numerator // part.denominator + 1 for face in faces.view(-1).tolist()]
+            cells = [
+                face * part.numerator // part.denominator + 1 for face in faces.view(-1).tolist()
+            ]
             columns.append(torch.tensor(cells, device=faces.device).view(faces.shape))
     return torch.stack(columns, -1)
 
@@ -153,9 +156,16 @@ def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
         if thresholds not in THRESHOLDS:
             raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {list(THRESHOLDS)}")
         return THRESHOLDS[thresholds]
-    pairs = tuple((float(share), int(corners)) for share, corners in thresholds)
-    if not pairs or not all(0 <= s <= 1 and 0 <= c <= 4 for s, c in pairs):
+    try:
+        pairs = tuple(
+            (real_number(share, "share"), whole_number(corners, "corners", 0, 4))
+            for share, corners in thresholds
+        )
+    except (TypeError, ValueError):
+        pairs = ()
+    if not pairs or not all(0 <= share <= 1 for share, _ in pairs):
         raise ValueError(
-            f"area_ratio thresholds {thresholds!r}: need pairs (share in [0, 1], corners in 0 … 4)"
+            f"area_ratio thresholds {shown(thresholds)}: need pairs (share in [0, 1], whole number"
+            " of corners in 0 … 4)"
         )
     return pairs

@@ -1,0 +1,203 @@
+r"""Strict static equilibrium decided exactly, where float64 leaves it open.
+
+The linear program is that of :mod:`marl_pack.stability.static_equilibrium`: forces
+:math:`f \ge 0` at the corners of the contacts balance every box, :math:`A f = w`, and the stack
+stands strictly if :math:`A f = w, f \ge t` has a solution with :math:`t > 0`. All numbers are
+fractions, so each equation is multiplied until it is whole.
+
+- Far from a tie, the simplex method in float64 decides.
+- At a tie, its dual solution is a motion of the boxes that no contact resists and no weight
+  opposes: :math:`y \ne 0, y^T A \ge 0, y^T w \le 0`. Rounded to fractions with small denominators,
+  it is checked in whole numbers, and proves that the stack does not stand strictly (Farkas).
+- What is still open goes to a simplex method in whole numbers by integer pivoting: the tableau is
+  stored times the last pivot, and every division leaves no remainder (Edmonds 1967; Bareiss 1968).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import count
+from math import lcm
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_pack.stability.simplex import NEAR, max_least_force
+
+Whole = NDArray[np.object_]
+"""Array of Python's whole numbers, which have no largest value."""
+DENOMINATORS = 10**6
+"""Largest denominator of the fractions to which a dual solution is rounded."""
+GROUND = -1
+"""Index of what never moves: the floor, and boxes that are known to stand."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """The weight of a box and its centre of mass seen from above, as exact numbers."""
+
+    weight: Fraction
+    x: Fraction
+    y: Fraction
+
+
+@dataclass(frozen=True)
+class Force:
+    """A force at a corner of a contact: it lifts one box and presses on another."""
+
+    x: int
+    y: int
+    upper: int  # index of the box it lifts
+    lower: int  # index of the box it presses on, or GROUND
+
+
+def stands_exactly(loads: Sequence[Load], forces: Iterable[Force]) -> bool:
+    """Return whether boxes are in strict static equilibrium, by exact arithmetic.
+
+    Args:
+        loads: of the boxes.
+        forces: that may act between them and the ground.
+    """
+    a, weights = _equations(loads, list(forces))
+    try:
+        rounded = a.astype(np.float64)
+        total = float(weights.sum())
+        relative = weights.astype(np.float64) * (len(loads) / total)
+    except OverflowError:  # decimals of hundreds of places
+        return _strictly_feasible(a, weights)
+    largest = np.abs(rounded).max(1, initial=1.0)
+    rounded /= largest[:, None]
+    force, reliable, basis = max_least_force(rounded, relative, 10 * NEAR)
+    if reliable and abs(force) > NEAR:
+        return bool(force > 0)
+    motion = _motion(rounded, basis) / largest
+    return not _moves_freely(a, weights, motion) and _strictly_feasible(a, weights)
+
+
+def _motion(a: NDArray[np.float64], basis: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the dual solution [R] of a basis of ``max t, a f = w, f ≥ t``; NaN if there is none.
+
+    Args:
+        a: the equations [R, F].
+        basis: as :func:`marl_pack.stability.simplex.max_least_force` returns it.
+    """
+    columns = np.hstack((a, a.sum(1, keepdims=True), np.eye(len(a))))[:, basis]
+    try:
+        return np.linalg.solve(columns.T, (basis == a.shape[1]).astype(np.float64))
+    except np.linalg.LinAlgError:
+        return np.full(len(a), np.nan)
+
+
+def _moves_freely(a: Whole, weights: Whole, motion: NDArray[np.float64]) -> bool:
+    """Return whether a motion, rounded to fractions, proves that boxes do not stand strictly.
+
+    Args:
+        a: the equations [R, F] in whole numbers.
+        weights: their right-hand side [R].
+        motion: float64 [R], any numbers.
+    """
+    largest = np.abs(motion).max(initial=0.0)
+    if not 0 < largest < np.inf:
+        return False
+    moving = np.flatnonzero(np.abs(motion) > largest / DENOMINATORS)
+    relative = (motion[moving] / largest).tolist()
+    fractions = [Fraction(value).limit_denominator(DENOMINATORS) for value in relative]
+    unit = lcm(*(fraction.denominator for fraction in fractions))
+    y = np.array([int(fraction * unit) for fraction in fractions], object)
+    return bool((y @ a[moving] >= 0).all() and y @ weights[moving] <= 0)
+
+
+def _equations(loads: Sequence[Load], forces: Sequence[Force]) -> tuple[Whole, Whole]:
+    """Return the equations of the balance of force and moments, whole numbers [R, F] and [R]."""
+    a = np.zeros((3 * len(loads), len(forces)), object)
+    for column, force in enumerate(forces):
+        for box, sign in ((force.upper, 1), (force.lower, -1)):
+            if box == GROUND:
+                continue
+            load = loads[box]
+            a[3 * box, column] = sign
+            a[3 * box + 1, column] = sign * (force.x * load.x.denominator - load.x.numerator)
+            a[3 * box + 2, column] = sign * (force.y * load.y.denominator - load.y.numerator)
+    unit = lcm(*(load.weight.denominator for load in loads))
+    weights = np.zeros(3 * len(loads), object)
+    for box, load in enumerate(loads):
+        weights[3 * box] = int(load.weight * unit)
+    return a, weights
+
+
+def _strictly_feasible(a: Whole, weights: Whole) -> bool:
+    """Return whether ``a f = weights`` has a solution in which all f are positive."""
+    rows, columns = a.shape
+    # Columns: the forces above t, t itself, the right-hand side. The last row is the objective.
+    table = np.zeros((rows + 1, columns + 2), object)
+    table[:rows, :columns] = a
+    table[:rows, columns] = a.sum(1)
+    table[:rows, -1] = weights
+    basis = np.arange(columns + 1, columns + 1 + rows)  # artificial variables, never stored
+    table[rows] = -table[:rows].sum(0)
+    scale = _optimise(table, basis, 1, columns)
+    if table[rows, -1] != 0:
+        return False
+    for row in np.flatnonzero(basis > columns):
+        candidates = np.flatnonzero(table[row, : columns + 1])
+        if candidates.size == 0:
+            return False  # the contacts cannot balance every small shift of the weights
+        if table[row, candidates[0]] < 0:
+            table[row] = -table[row]
+        scale = _pivot(table, basis, scale, int(row), int(candidates[0]))
+    table[rows] = 0
+    table[rows, columns] = -scale
+    for row in np.flatnonzero(basis == columns):
+        table[rows] += table[row]
+    _optimise(table, basis, scale, columns)
+    return any(table[row, -1] > 0 for row in np.flatnonzero(basis == columns))
+
+
+def _pivot(table: Whole, basis: NDArray[np.int64], scale: int, row: int, column: int) -> int:
+    """Bring ``column`` into the basis in place of the variable of ``row``; return the new scale."""
+    pivot = table[row, column]
+    others = np.arange(len(table)) != row
+    factors = table[others, column]
+    table[others] = (table[others] * pivot - factors[:, None] * table[row]) // scale
+    basis[row] = column
+    return int(pivot)
+
+
+def _optimise(table: Whole, basis: NDArray[np.int64], scale: int, t: int) -> int:
+    """Minimise the last row's objective by the simplex method; return the table's scale.
+
+    Largest coefficient first; Bland's rule once that might cycle, so that it ends. The search for a
+    positive t stops at the first one.
+
+    Args:
+        table: whole numbers [R + 1, F + 2], times ``scale``.
+        basis: the variable of each row [R].
+        scale: the last pivot.
+        t: the column of t.
+    """
+    rows = len(basis)
+    first_phase = bool((basis > t).any())
+    for iteration in count():
+        negative = np.flatnonzero(table[rows, : t + 1] < 0)
+        if negative.size == 0:
+            break
+        bland = iteration > 5 * rows + 50
+        column = int(negative[0] if bland else np.argmin(table[rows, : t + 1]))
+        best = -1
+        for row in range(rows):
+            if table[row, column] <= 0:
+                continue
+            if best >= 0:
+                ratio = table[row, -1] * table[best, column]
+                least = table[best, -1] * table[row, column]
+                if ratio > least or (ratio == least and basis[row] > basis[best]):
+                    continue
+            best = row
+        if best < 0:
+            break
+        scale = _pivot(table, basis, scale, best, column)
+        if not first_phase and any(table[row, -1] > 0 for row in np.flatnonzero(basis == t)):
+            break
+    return scale
