@@ -15,6 +15,10 @@ NEAR = 1e-6
 """Least force, or least error of the equations, in mean weights, above which float64 decides."""
 
 
+SMALLEST_PIVOT = 1e-6
+"""A division by less than this may blow up rounding errors, so float64 is not trusted then."""
+
+
 @njit(cache=True)
 def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
     """Bring ``column`` into the basis in place of the variable of ``row``."""
@@ -63,8 +67,8 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
                     better = tied and pivot > table[row, column]
                 if ratio < best - 1e-13 or better:
                     row, best = i, ratio
-        if row < 0:  # forces are bounded by the weights: only rounding errors end up here
-            return False
+        if row < 0 or table[row, column] < SMALLEST_PIVOT:
+            return False  # forces are bounded by the weights, so a row exists but for rounding
         _pivot(table, basis, row, column)
     return False
 
