@@ -85,10 +85,7 @@ class Bins:
         more = most - self.boxes.shape[1]
         if more <= 0:
             return self
-        tables = (f.name for f in fields(self) if f.metadata == ROW_PER_BOX)
-        padded: dict[str, Any] = {
-            name: pad(getattr(self, name), (0, 0, 0, more)) for name in tables
-        }
+        padded: dict[str, Any] = {name: pad(getattr(self, name), (0, 0, 0, more)) for name in ROWS}
         return replace(self, **padded)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Bins:
@@ -104,6 +101,8 @@ class Bins:
 
 TENSORS = tuple(f.name for f in fields(Bins) if f.type == "Tensor")
 """Names of the fields of :class:`Bins` that are tensors; they come first."""
+ROWS = tuple(f.name for f in fields(Bins) if f.metadata == ROW_PER_BOX)
+"""Names of the fields of :class:`Bins` that have one row for each box."""
 _tensors_of: Callable[[Bins], tuple[Tensor, ...]] = attrgetter(*TENSORS)
 
 

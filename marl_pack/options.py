@@ -159,7 +159,7 @@ def choose_policies(
         raise ValueError("--symmetric: needs a run's folder or checkpoint")
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
-    from marl_pack.agents.loading import Loader, trained_on
+    from marl_pack.agents.loading import Loader, trained_game, trained_on
 
     settings = arguments.device, arguments.seed, arguments.symmetric
     policies = {name: Loader(*settings).policy(name) for name in names}
@@ -172,8 +172,12 @@ def choose_policies(
     for source in sources:
         if source not in ORIENTATION_AGENTS:
             checkpoint = checkpoints.read(source)
-            learned = learned or checkpoint["config"]["game"]
-            console.print(f"{source}: trained on {trained_on(checkpoint)}", soft_wrap=True)
+            try:
+                learned = learned or trained_game(checkpoint)
+                description = trained_on(checkpoint)
+            except ValueError as error:
+                raise ValueError(f"{source}: {error}") from None
+            console.print(f"{source}: trained on {description}", soft_wrap=True)
     return policies, learned
 
 
@@ -189,7 +193,7 @@ def with_search(
         ValueError: if the settings cannot be read, or there is no checkpoint to search with.
     """
     from marl_pack.agents.learning import checkpoint as checkpoints
-    from marl_pack.agents.loading import Loader
+    from marl_pack.agents.loading import Loader, trained_game
     from marl_pack.agents.search import SearchSettings
 
     settings = SearchSettings.parse(arguments.plan)
@@ -201,7 +205,7 @@ def with_search(
             policies_with_search[name] = policy
             continue
         checkpoint = checkpoints.read(name, arguments.device)
-        game = checkpoint["config"]["game"]
+        game = trained_game(checkpoint)
         learned = stream
         if game["items"] in GENERATED:
             try:

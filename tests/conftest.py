@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,34 @@ def random_maps(
         return (top <= bins.height) & inside.unflatten(0, item.sides.shape[:2])
 
     return random_play(anywhere, n, size, sides, steps, seed)
+
+
+def mirrored_map(values: Tensor, symmetry: int) -> Tensor:
+    """Maps [G, W, D] with x mirrored (1), y mirrored (2), and then x and y swapped (4)."""
+    if symmetry & 1:
+        values = values.flip(1)
+    if symmetry & 2:
+        values = values.flip(2)
+    return values.transpose(1, 2) if symmetry & 4 else values
+
+
+def mirrored(bins: Bins, symmetry: int) -> Bins:
+    """The bins after a symmetry, their boxes and their maps."""
+    maps = (mirrored_map(values, symmetry) for values in (bins.heightmap, bins.empty_map))
+    boxes, loads = bins.boxes.clone(), bins.loads.clone()
+    for axis in (0, 1):
+        if symmetry & 1 << axis:
+            boxes[..., axis] = bins.size[axis] - boxes[..., axis] - boxes[..., axis + 3]
+            loads[..., axis + 1] = bins.size[axis] - loads[..., axis + 1]
+    if symmetry & 4:
+        boxes, loads = boxes[..., [1, 0, 2, 4, 3, 5]], loads[..., [0, 2, 1]]
+    heightmap, empty_map = maps
+    return replace(bins, heightmap=heightmap, empty_map=empty_map, boxes=boxes, loads=loads)
+
+
+def put_boxes(game: Packing, bins: Bins) -> None:
+    """Put the boxes of other bins into a game, with new masks."""
+    game.set_state(replace(game.state, bins=bins))
 
 
 def boxes_of(bins: Bins, i: int) -> np.ndarray:

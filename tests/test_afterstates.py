@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import in_play
+from conftest import in_play, mirrored, put_boxes
 from small_runs import same
 from torch import Tensor
 
@@ -68,9 +68,7 @@ def test_features_do_not_change_when_the_bin_is_rotated() -> None:
     o, c = make_policy("dblf")(game)
     own = features_of(game, o, c)
     other = in_play(16, 6)
-    for maps in (other.bins.heightmap, other.bins.empty_map):
-        maps.copy_(maps.transpose(1, 2).flip(1).clone())
-    other.set_state(other.state)
+    put_boxes(other, mirrored(other.bins, 2 | 4))
     # Rotated by 90 degrees about the vertical, the item stands at the mirrored corner.
     width = other.orient(o ^ 1).sides[:, 0].long()
     x, y = game.floor.corner(c)

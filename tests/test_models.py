@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import mirrored, put_boxes
 
 from marl_pack import config
 from marl_pack.agents import learned
@@ -41,14 +42,12 @@ def test_in_all_symmetries_a_model_plays_the_same_in_the_mirrored_bin() -> None:
     game = Packing(64, seed=3)
     for _ in range(4):
         game.place(*make_policy("random", 2)(game))
-    mirrored = game.branch(torch.arange(game.n))
-    for maps in ("heightmap", "empty_map"):
-        getattr(mirrored.bins, maps).copy_(getattr(game.bins, maps).flip(1))
-    mirrored.set_state(mirrored.state)
+    other = game.branch(torch.arange(game.n))
+    put_boxes(other, mirrored(game.bins, 1))
 
     def agreement(symmetric: bool) -> float:
         policy = Loader(symmetric=symmetric).policy(str(MODELS[-1]))
-        (orientation, cell), (other_orientation, other_cell) = policy(game), policy(mirrored)
+        (orientation, cell), (other_orientation, other_cell) = policy(game), policy(other)
         x, y = game.floor.corner(cell)
         x = 10 - game.orient(orientation).sides[:, 0].long() - x
         same = (orientation == other_orientation) & (game.floor.cell(x, y) == other_cell)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from conftest import mirrored, mirrored_map, put_boxes
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic
@@ -35,22 +36,11 @@ def played(size: tuple[int, int, int]) -> Packing:
     return game
 
 
-def mirrored_map(heightmap: Tensor, symmetry: int) -> Tensor:
-    """Return maps [G, W, D] after one symmetry."""
-    if symmetry & 1:
-        heightmap = heightmap.flip(1)
-    if symmetry & 2:
-        heightmap = heightmap.flip(2)
-    return heightmap.transpose(1, 2) if symmetry & 4 else heightmap
-
-
 def in_mirrored_bin(game: Packing, symmetry: int) -> Packing:
-    """Return the same games in the mirrored bin: maps mirrored, the same items, masks computed."""
+    """Return the same games in the mirrored bin: boxes mirrored, the same items, masks computed."""
     size = (game.size[1], game.size[0], game.size[2]) if symmetry & 4 else game.size
     other = Packing(game.n, size, sides=(1, 4), seed=5)
-    other.bins.heightmap.copy_(mirrored_map(game.bins.heightmap, symmetry))
-    other.bins.empty_map.copy_(mirrored_map(game.bins.empty_map, symmetry))
-    other.bins.filled.copy_(game.bins.filled)
+    put_boxes(other, mirrored(game.bins, symmetry))
     other.set_state(replace(other.state, items=game.items))
     return other
 
@@ -74,13 +64,13 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
     kind, action = AGENT_KINDS[agent], orientation
     if kind.acts_on_cells:
         action = cell if kind.orientations == 1 else game.floor.pair(orientation, cell)
-    mirrored, moved = transform(observation, action[:, None].float(), agent, symmetries)
-    assert mirrored.keys() == expected.keys()
+    transformed, moved = transform(observation, action[:, None].float(), agent, symmetries)
+    assert transformed.keys() == expected.keys()
     for name, values in expected.items():
         if name.endswith("afterstate_value"):  # sums in another order
-            assert torch.allclose(mirrored[name], values, atol=1e-5), name
+            assert torch.allclose(transformed[name], values, atol=1e-5), name
         else:
-            assert torch.equal(mirrored[name], values), name
+            assert torch.equal(transformed[name], values), name
     if not kind.acts_on_cells:
         assert torch.equal(moved.squeeze(1).long(), rotated)
         return

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from marl_pack.agents.heuristics import (
 )
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.learning.form import check_alike
 from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.networks.kinds import JOINT, ORIENTATION, PLACEMENT
 from marl_pack.agents.policy import (
@@ -72,7 +74,9 @@ class Loader:
         """
         if source in POLICIES:
             return make_policy(source, self.seed, self.device)
-        return self.policy_of(checkpoints.read(_path(source, POLICIES), self.device))
+        checkpoint = checkpoints.read(_path(source, POLICIES), self.device)
+        with _named(source):
+            return self.policy_of(checkpoint)
 
     def orientation_agent(self, source: str) -> OrientationAgent:
         """Return the orientation agent that ``source`` names; of a joint agent its orientations.
@@ -83,9 +87,11 @@ class Loader:
         if source not in ORIENTATION_AGENTS:
             checkpoint = checkpoints.read(_path(source, ORIENTATION_AGENTS), self.device)
             if JOINT in checkpoint["agents"]:
-                policy = self.policy_of(checkpoint)
+                with _named(source):
+                    policy = self.policy_of(checkpoint)
                 return lambda game: policy(game)[0]
-        return self.orientation_agent_of(record_of(source, ORIENTATION))
+        with _named(source):
+            return self.orientation_agent_of(record_of(source, ORIENTATION))
 
     def placement_agent(self, source: str) -> PlacementAgent:
         """Return the placement agent that ``source`` names.
@@ -93,7 +99,8 @@ class Loader:
         Raises:
             ValueError, FileNotFoundError: if there is no such agent.
         """
-        return self.placement_agent_of(record_of(source, PLACEMENT))
+        with _named(source):
+            return self.placement_agent_of(record_of(source, PLACEMENT))
 
     # --- from records and checkpoints -------------------------------------------------------------
 
@@ -167,12 +174,12 @@ class Loader:
         )
         critic = None
         if settings.depth is not None:
-            config = checkpoint["config"]
-            alpha, gamma = config["game"]["alpha"], config["ppo"]["gamma"]
+            alpha = trained_game(checkpoint)["alpha"]
+            gamma = checkpoint["config"].get("ppo", {}).get("gamma")
             if (alpha, gamma) != (1, 1):
                 raise ValueError(
                     f"plan: a depth needs agents trained with game.alpha = 1 and ppo.gamma = 1, "
-                    f"whose critic estimates shares of the bin, not {alpha:g} and {gamma:g}"
+                    f"whose critic estimates shares of the bin, not {alpha} and {gamma}"
                 )
             critic = load_critic(checkpoint, ORIENTATION, self.device, first.actor)
         return Planner(first, second, critic, settings, futures, self.seed or 0)
@@ -191,12 +198,10 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
     """
     if "network" not in record:
         raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
-    try:
-        with torch.random.fork_rng(devices=[]):  # a run's random numbers must stay
-            actor = make_actor(kind, record["network"], device)
-        actor.load_state_dict(record["actor_state_dict"])
-    except (RuntimeError, TypeError, KeyError) as error:
-        raise ValueError(f"the {kind} agent's weights do not match its network: {error}") from None
+    checkpoints.check_weights(record, kind)
+    with torch.random.fork_rng(devices=[]):  # a run's random numbers must stay
+        actor = make_actor(kind, record["network"], device)
+    actor.load_state_dict(record["actor_state_dict"])
     return actor.eval()
 
 
@@ -213,13 +218,13 @@ def load_critic(
     Raises:
         ValueError: if the agent has no critic, or its weights do not match its network.
     """
-    agent = checkpoint["agents"][kind]
-    try:
-        with torch.random.fork_rng(devices=[]):
-            critic = make_critic(kind, agent["network"], device, actor)
-        critic.load_state_dict(agent["critic_state_dict"])
-    except (RuntimeError, KeyError) as error:
-        raise ValueError(f"the {kind} agent has no matching critic: {error}") from None
+    agent = checkpoints.agent_of(checkpoint, kind)
+    if "critic_state_dict" not in agent:
+        raise ValueError(f"the {kind} agent has no critic: critic_state_dict is missing")
+    checkpoints.check_weights(agent, kind)
+    with torch.random.fork_rng(devices=[]):
+        critic = make_critic(kind, agent["network"], device, actor)
+    critic.load_state_dict(agent["critic_state_dict"])
     return critic.eval()
 
 
@@ -237,9 +242,10 @@ def load_afterstate_critic(
     with torch.random.fork_rng(devices=[]):
         critic = AfterstateCritic().to(device)
     try:
-        critic.load_state_dict(weights)
-    except RuntimeError as error:
+        check_alike(weights, critic.state_dict(), "afterstate_critic")
+    except ValueError as error:
         raise ValueError(f"the critic of afterstates does not match: {error}") from None
+    critic.load_state_dict(weights)
     return critic.eval()
 
 
@@ -256,21 +262,46 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     if source in NAMES[name]:
         return {"name": source}
     checkpoint = checkpoints.read(_path(source, NAMES[name]))
-    try:
+    with _named(source):
         return checkpoints.agent_record(checkpoint, name)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+
+
+def trained_game(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the game that a checkpoint's agents were trained on.
+
+    They are the options of :class:`marl_pack.game.spec.GameSpec`, ``items`` and ``sides``.
+
+    Raises:
+        ValueError: if one that every version wrote is missing, or an option is impossible.
+    """
+    game = checkpoint["config"].get("game", {})
+    for key in ("bin", "rule", "items", "sides"):
+        if key not in game:
+            raise ValueError(f"config.game.{key} is missing")
+    return GameSpec.of(game).to_dict() | {key: game[key] for key in ("items", "sides")}
 
 
 def trained_on(checkpoint: Mapping[str, Any]) -> str:
-    """Describe the game that a checkpoint's agents were trained on, and for how many items."""
-    config = checkpoint["config"]
-    game = config["game"]
+    """Describe the game that a checkpoint's agents were trained on, and for how many items.
+
+    Raises:
+        ValueError: if its settings are not those of a game.
+    """
+    game, seed = trained_game(checkpoint), checkpoint["config"].get("seed", "unknown")
     sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
     return (
-        f"{game['items']}{sides}, {GameSpec.of(game)}, {checkpoint['items']:,} items, "
-        f"seed {config['seed']}"
+        f"{game['items']}{sides}, {GameSpec.of(game)}, {checkpoint['items']:,} items, seed {seed}"
     )
+
+
+@contextlib.contextmanager
+def _named(source: str) -> Iterator[None]:
+    """Put the name of a source before the errors of what it holds, once."""
+    try:
+        yield
+    except ValueError as error:
+        named = str(error).startswith(f"{source}") or repr(source) in str(error)
+        raise ValueError(str(error) if named else f"{source}: {error}") from None
 
 
 def _path(source: str, names: Sequence[str]) -> Path:

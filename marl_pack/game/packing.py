@@ -11,6 +11,7 @@ more items, or when the bin holds as many as it may.
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import UNKNOWN, Bins, check_device
 from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameSpec, document
-from marl_pack.game.state import GameState
+from marl_pack.game.state import GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.geometry import orientation_table
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
@@ -35,6 +36,8 @@ from marl_pack.stability import OrientedItem
 
 MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
+LAST_EPISODE = 2**62
+"""The largest number of an episode."""
 
 
 @document(" " * 8)
@@ -162,20 +165,23 @@ class Packing:
         if seed is not None:
             self.seed = int(seed)
         bin_state.clear(self._bins, slice(None))
-        episode = self._games + first_episode
+        self._start(self._games + first_episode)
+        if self.auto_reset:
+            self._restart(~self.alive)
+
+    def _start(self, episode: Tensor) -> None:
+        """Begin episodes, int64 [G], in the empty bins."""
         t = torch.zeros_like(episode)
         stream = self.stream.start(self.seed, episode)
         lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
         self.state = GameState(self._bins, self.stream.item(stream, t), episode, t, lost, stream)
         self._find_moves()
-        if self.auto_reset:
-            self._restart(~self.alive)
 
     def set_state(self, state: GameState) -> None:
         """Put the games into a copy of a state, such as one of :meth:`GameState.select`.
 
         Raises:
-            ValueError: if it is of other games; nothing has changed then.
+            ValueError: if it is of other games, or no game comes into it; nothing has changed then.
         """
         self.state.load(state.tensors())
         self._find_moves()
@@ -183,21 +189,77 @@ class Packing:
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of all tensors that the rest of the games depends on."""
         tensors = {name: tensor.clone() for name, tensor in self.state.tensors().items()}
-        return tensors | {"items_fingerprint": torch.tensor(fingerprint(self.stream))}
+        return tensors | self._origin()
+
+    def _origin(self) -> dict[str, Tensor]:
+        """Return numbers that differ between games of other items, options or seeds."""
+        options = hashlib.blake2b(repr(self.spec.to_dict()).encode(), digest_size=7).digest()
+        return {
+            "items_fingerprint": torch.tensor(fingerprint(self.stream)),
+            "options_fingerprint": torch.tensor(int.from_bytes(options, "little")),
+            "seed": torch.tensor(self.seed % 2**63),
+        }
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore a :meth:`state_dict` of games made with the same arguments.
 
+        The choices in it are played again, so it may come from a file that nobody vouches for.
+
         Raises:
-            ValueError: if it is of other games.
+            ValueError: if it is of other games, or they do not come into it; nothing has changed
+                then.
         """
-        tensors, own = dict(tensors), torch.tensor(fingerprint(self.stream))
-        if not torch.equal(tensors.pop("items_fingerprint", ~own).cpu(), own):
-            raise ValueError(
-                "state of another game: needs the items of this game; was their file changed?"
-            )
-        self.state.load(tensors)
+        tensors = dict(tensors)
+        for name, own in self._origin().items():
+            given = tensors.pop(name, own)  # the games are played again in any case
+            if not isinstance(given, Tensor) or not torch.equal(given.cpu(), own):
+                what = name.removesuffix("_fingerprint")
+                changed = "; was their file changed?" if what == "items" else ""
+                raise ValueError(f"state of another game: needs the {what} of this game{changed}")
+        state = self.state.holding(tensors)
+        self._check_origin(state)
+        self.state.copy_from(state)
         self._find_moves()
+
+    def _check_origin(self, state: GameState) -> None:
+        """Refuse a state that the choices in it, played again in these games, do not lead to.
+
+        Raises:
+            ValueError: naming the first game and tensor that are wrong.
+        """
+        again, count = copy.copy(self), state.bins.count
+        again.auto_reset = False
+        again._bins = bin_state.empty(
+            self.n, self.size, state.bins.boxes.shape[1], self.device, self.backend
+        )
+        beyond = (state.episode < -LAST_EPISODE) | (state.episode > LAST_EPISODE)
+        refuse_where(beyond, "episode", "the number of an episode")
+        again._start(state.episode.clone())
+        refuse_where(again.state.stream != state.stream, "stream", "the items of its episode")
+        for k in range(int(count.max())):
+            again.alive = again.alive & (k < count)
+            x, y = state.bins.boxes[:, k, :2].long().unbind(1)
+            cell = torch.where(again.alive, self.floor.cell(x, y), 0)
+            orientation = torch.where(again.alive, state.bins.labels[:, k, 1], 0)
+            try:
+                again.place(orientation, cell)
+            except ValueError as error:
+                raise ValueError(f"state of another game: {error}") from None
+        may_lose = again.alive & (again.orientation_mask & ~again.moves.orientations).any(1)
+        refuse_where(state.lost & ~may_lose, "lost", "false")
+        if self.auto_reset:
+            refuse_where(state.lost | ~again.alive, "episode", "one that has not ended")
+        again.state.lost = state.lost
+        real = torch.arange(state.bins.boxes.shape[1], device=self.device) < count[:, None]
+        others = again.state.tensors()
+        for name, value in state.tensors().items():
+            other = others[name]
+            wrong = value != other
+            if value.is_floating_point():  # devices may round differently
+                wrong &= ~torch.isclose(value, other, rtol=1e-12, atol=0)
+            if name.removeprefix("bins.") in bin_state.ROWS:
+                wrong &= real[..., None]
+            refuse_where(wrong, name, "what the choices in it lead to")
 
     def branch(
         self,

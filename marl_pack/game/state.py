@@ -11,9 +11,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from marl_pack.bins import Bins
+from marl_pack.bins import UNKNOWN, Bins, empty, place
+from marl_pack.checks import shown
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items.items import Items
 
 
@@ -46,20 +49,87 @@ class GameState:
             tensors: as :meth:`tensors` names them.
 
         Raises:
-            ValueError: if one is missing, unknown or has another shape; nothing has changed then.
+            ValueError: if one is missing, unknown or of another shape or type, or if no game can
+                come into this state; nothing has changed then.
+        """
+        self.copy_from(self.holding(tensors))
+
+    def copy_from(self, state: GameState) -> None:
+        """Copy the tensors of another state of the same shapes into this one."""
+        for own, tensor in zip(self.tensors().values(), state.tensors().values(), strict=True):
+            own.copy_(tensor)
+
+    def holding(self, tensors: Mapping[str, Tensor]) -> GameState:
+        """Return a state of the same games that holds other tensors; this one does not change.
+
+        Args, Raises: as for :meth:`load`.
         """
         own = self.tensors()
         unknown = sorted(set(tensors) - set(own))
         if unknown:
-            raise ValueError(f"state of another game: this one has no {', '.join(unknown)}")
+            raise _of_another_game(f"this one has no {', '.join(unknown)}")
         for name, tensor in own.items():
-            if name not in tensors or tensors[name].shape != tensor.shape:
-                shape = list(tensors[name].shape) if name in tensors else "missing"
-                raise ValueError(
-                    f"state of another game: {name} is {shape}, needs {list(tensor.shape)}"
-                )
-        for name, tensor in own.items():
+            if name not in tensors:
+                raise _of_another_game(f"{name} is missing, needs {list(tensor.shape)}")
+            given = tensors[name]
+            if not isinstance(given, Tensor):
+                raise _of_another_game(f"{name} is {shown(given)}, needs a tensor")
+            if given.shape != tensor.shape:
+                raise _of_another_game(f"{name} is {list(given.shape)}, needs {list(tensor.shape)}")
+            if given.dtype != tensor.dtype:
+                raise _of_another_game(f"{name} is {given.dtype}, needs {tensor.dtype}")
+        state = self.select(torch.arange(len(self), device=self.t.device))  # a copy
+        for name, tensor in state.tensors().items():
             tensor.copy_(tensors[name])
+        state.check()
+        return state
+
+    def check(self) -> None:
+        """Refuse a state that no game comes into: what is derived must follow from the boxes.
+
+        Raises:
+            ValueError: naming the first game and tensor that are wrong, and what would be right.
+        """
+        bins, items = self.bins, self.items
+        most, longest = bins.boxes.shape[1], max(bins.size)
+        refuse_where((bins.count < 0) | (bins.count > most), "bins.count", f"from 0 to {most}")
+        real = torch.arange(most, device=bins.device) < bins.count[:, None]  # [G, M]
+        corners, sides = bins.boxes[..., :3].long(), bins.boxes[..., 3:].long()
+        top = torch.tensor(bins.size, device=bins.device)
+        inside = (corners >= 0) & (sides >= 1) & (corners + sides <= top)
+        refuse_where(real & ~inside.all(2), "bins.boxes", "boxes in the bin")
+        weights, centres = bins.loads[..., 0], bins.loads[..., 1:]
+        middle = centres - corners[..., :2]
+        balanced = (weights > 0) & weights.isfinite()
+        balanced &= ((middle >= 0) & (middle <= sides[..., :2])).all(2)
+        refuse_where(real & ~balanced, "bins.loads", "a positive weight over the box's base")
+        labels = (bins.labels >= UNKNOWN).all(2) & (bins.labels[..., 1] < len(ORIENTATIONS))
+        refuse_where(real & ~labels, "bins.labels", "an item's number and an orientation")
+        rebuilt = empty(len(self), bins.size, most, bins.device, bins.backend)
+        for k in range(int(bins.count.max())):
+            present = torch.where(real[:, k, None], bins.boxes[:, k, 3:], 0)
+            place(rebuilt, present, torch.where(real[:, k, None], corners[:, k, :2], 0))
+        for name in ("heightmap", "empty_map", "filled", "boxes"):
+            wrong = getattr(bins, name) != getattr(rebuilt, name)
+            wrong = wrong & real[..., None] if name == "boxes" else wrong
+            refuse_where(wrong, f"bins.{name}", "what follows from the boxes, each on those below")
+        shape = (items.sides >= 1) & (items.sides <= longest)
+        present = items.sides.any(1)
+        refuse_where(present & ~shape.all(1), "items.sides", f"from 1 to {longest}, or zeros")
+        heavy = (items.weights > 0) & items.weights.isfinite()
+        refuse_where(present & ~heavy, "items.weights", "a positive number")
+        refuse_where(self.t < 0, "t", "0 or more")
+
+
+def refuse_where(wrong: Tensor, name: str, needs: str) -> None:
+    """Raise ValueError with the first game in which a tensor of a state is wrong, bool [G, …]."""
+    games = wrong.flatten(1).any(1) if wrong.dim() > 1 else wrong
+    if bool(games.any()):
+        raise _of_another_game(f"{name} of game {int(games.int().argmax())}: needs {needs}")
+
+
+def _of_another_game(reason: str) -> ValueError:
+    return ValueError(f"state of another game: {reason}")
 
 
 def _tensors(record: Any, prefix: str = "") -> Iterator[tuple[str, Tensor]]:

@@ -93,8 +93,10 @@ def other_agents(
             if source is None:
                 continue
             if checkpoint is not None:
-                stored = checkpoint["agents"][name]
+                stored = checkpoints.agent_of(checkpoint, name)
                 record = stored if agent.frozen else stored.get("teacher")
+                if record is None and checkpoint["iter"] + 1 < agent.teacher_iterations:
+                    raise ConfigError(f"{name}.{key}: agents.{name}.teacher is missing")
             else:
                 try:
                     record = record_of(source, name)

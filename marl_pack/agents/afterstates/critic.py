@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.layers import initialized
+from marl_pack.checks import whole_number
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 
@@ -133,7 +134,21 @@ class AfterstateLearner:
         return recorded | {"rollouts": self.rollouts}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the rollouts that :meth:`state_dict` returned."""
-        for name in ("inputs", "targets", "legal"):
-            getattr(self, name)[: len(state[name])] = state[name]
-        self.rollouts = state["rollouts"]
+        """Restore the rollouts that :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if they are of another run; nothing has changed then.
+        """
+        names = ("inputs", "targets", "legal")
+        rollouts = whole_number(state.get("rollouts"), "afterstates.rollouts", 0)
+        stored = min(rollouts, self.capacity)
+        for name in names:
+            own, values = getattr(self, name)[:stored], state.get(name)
+            if not isinstance(values, Tensor) or (values.dtype, values.shape) != (
+                own.dtype,
+                own.shape,
+            ):
+                raise ValueError(f"afterstates.{name}: needs {own.dtype} {list(own.shape)}")
+        for name in names:
+            getattr(self, name)[:stored] = state[name]
+        self.rollouts = rollouts

@@ -27,13 +27,53 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from marl_pack.agents.learning import migration
+from marl_pack.agents.learning.form import Plain, check_alike, check_form
+from marl_pack.agents.networks.actor_critic import make_actor, make_critic
+from marl_pack.agents.networks.kinds import AGENT_KINDS
 from marl_pack.agents.networks.planes import need_critic
+from marl_pack.agents.networks.trunk import Network
+from marl_pack.checks import shown, whole_number
 from marl_pack.files import write_atomically
 
 FORMAT = 2
+MOST_SHARED = 4
+"""How often the same tensor may stand in a checkpoint, on average."""
 LATEST, BEST = "latest.pt", "best.pt"
+
+NOTHING = type(None)
+_WEIGHTS = {str: Tensor}
+_NETWORK = {"planes": [str]}
+_OPTIMIZER = {"state": {int: {str: (Tensor, NOTHING)}}, "param_groups": [{"params": [int]}]}
+_AGENT: dict[str, Any] = {
+    "name": str, "network": _NETWORK, "actor_state_dict": _WEIGHTS, "critic_state_dict": _WEIGHTS,
+    "optimizer_state_dict": _OPTIMIZER, "afterstate_critic": _WEIGHTS,
+}  # fmt: skip
+_AGENT |= {"teacher": _AGENT, "imitated": _AGENT}
+_SETTINGS = dict.fromkeys(("policy", "teacher", "imitate"), (str, NOTHING)) | {"network": _NETWORK}
+FORM = {
+    "marl_pack": str,
+    "config": {
+        "seed": int,
+        "game": {"bin": [int, int, int], "items": str, "sides": [int, int]},
+        "ppo": {"gamma": float},
+        "orientation": _SETTINGS, "placement": _SETTINGS,
+    },
+    "agents": dict.fromkeys(AGENT_KINDS, _AGENT),
+    "afterstate_critic": _WEIGHTS, "afterstate_optimizer": _OPTIMIZER, "afterstates": _OPTIMIZER,
+    "iter": int, "items": int, "seconds": float, "schedule_iteration": int,
+    "evaluations": [{str: (float, NOTHING)}],
+    "state": [{
+        "game": _WEIGHTS, "random": _WEIGHTS, "afterstates": {"rollouts": int},
+        "logger": {"tot_timesteps": int, "tot_time": float},
+    }],
+}  # fmt: skip
+"""The form of a checkpoint, of every format (:func:`marl_pack.agents.learning.form.check_form`).
+
+Settings and networks check the values of their own fields.
+"""
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
@@ -63,7 +103,8 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if the file is truncated, of another program or of a newer format.
+        ValueError: if the file is truncated, of another program or of a newer format, or a value in
+            it has not the form of a checkpoint's (:data:`FORM`).
     """
     path = resolve(source)
     path.open("rb").close()  # raises the system's error if it may not be read
@@ -72,29 +113,75 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
             f"{path}: not a checkpoint, or cut short ({path.stat().st_size:,} bytes); "
             "use another of the run's files"
         )
+    unreadable = f"{path}: not a checkpoint that can be read"
     try:
-        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
-            if archive.testzip() is not None:
-                raise ValueError("damaged")
-        checkpoint = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:
-        first = str(error).strip().splitlines()[:1]
-        raise ValueError(f"{path}: not a checkpoint that can be read ({first})") from None
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            # torch compresses nothing, so a file's members are not larger than the file.
+            compressed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
+            if compressed or sum(member.file_size for member in members) > path.stat().st_size:
+                raise ValueError(f"{unreadable}: its members are larger than itself")
+            if archive.testzip() is not None:  # torch does not look at the checksums
+                raise ValueError(f"{unreadable}: damaged")
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
+        raise ValueError(f"{unreadable}: damaged") from None
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception:  # of many kinds; their texts advise to trust the file
+        raise ValueError(f"{unreadable}: holds more than tensors and plain values") from None
+    try:
+        return _checked(content, path.stat().st_size)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _checked(content: Any, size: int) -> dict[str, Any]:
+    """Return the content of a file of ``size`` bytes as a checkpoint of this version's format.
+
+    Raises:
+        ValueError: if it is none.
+    """
     parts = ("format", "agents", "config", "iter", "items")
-    if (
-        not isinstance(checkpoint, dict)
-        or any(part not in checkpoint for part in parts)
-        or not isinstance(checkpoint["agents"], dict)
-    ):
-        raise ValueError(f"{path}: not a checkpoint of marl_pack.train")
-    if checkpoint["format"] == 1:
-        checkpoint = migration.from_format_1(checkpoint)
-    if checkpoint["format"] != FORMAT:
+    if not isinstance(content, Mapping) or any(part not in content for part in parts):
+        raise ValueError("not a checkpoint of marl_pack.train")
+    if type(content["format"]) is not int or not 1 <= content["format"] <= FORMAT:
         raise ValueError(
-            f"{path}: has checkpoint format {checkpoint['format']}, this version reads up to "
-            f"{FORMAT}"
+            f"has checkpoint format {shown(content['format'])}, this version reads up to {FORMAT}"
         )
-    return checkpoint
+    checkpoint: dict[str, Any] = Plain(MOST_SHARED * size).copy(content)
+    unresumable = isinstance(checkpoint.get("state"), str)  # the reason why
+    check_form({k: v for k, v in checkpoint.items() if k != "state" or not unresumable}, FORM, "")
+    for key, low in (("iter", -1), ("items", 0)):
+        whole_number(checkpoint[key], key, low)
+    unknown = [name for name in checkpoint["agents"] if name not in AGENT_KINDS]
+    if unknown:
+        raise ValueError(f"agents: {shown(unknown[0])} is none of {', '.join(AGENT_KINDS)}")
+    for name, agent in checkpoint["agents"].items():
+        _check_player(agent, f"agents.{name}")
+        for teacher in agent.keys() & {"teacher", "imitated"}:
+            _check_player(agent[teacher], f"agents.{name}.{teacher}")
+    return migration.from_format_1(checkpoint) if checkpoint["format"] == 1 else checkpoint
+
+
+def _check_player(record: Mapping[str, Any], where: str) -> None:
+    """Refuse the record of an agent that has neither a heuristic's name nor a network."""
+    if "name" not in record:
+        for part in ("network", "actor_state_dict"):
+            if part not in record:
+                raise ValueError(f"{where}.{part} is missing")
+
+
+def agent_of(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the record of one agent of a checkpoint.
+
+    Raises:
+        ValueError: if there is no such agent.
+    """
+    agent: dict[str, Any] | None = checkpoint["agents"].get(name)
+    if agent is None:
+        agents = ", ".join(checkpoint["agents"]) or "none"
+        raise ValueError(f"the checkpoint has no {name} agent; it has: {agents}")
+    return agent
 
 
 def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -105,14 +192,44 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
         name: of the agent.
 
     Raises:
-        ValueError: if there is no such agent.
+        ValueError: if there is no such agent, or it lacks the critic whose values it sees.
     """
-    agent = checkpoint["agents"].get(name)
-    if agent is None:
-        agents = ", ".join(checkpoint["agents"]) or "none"
-        raise ValueError(f"the checkpoint has no {name} agent; it has: {agents}")
+    agent = agent_of(checkpoint, name)
     parts = ("name", "network", "actor_state_dict", "afterstate_critic")
     record = {key: value for key, value in agent.items() if key in parts}
-    if need_critic(record.get("network", {}).get("planes", ())):
-        record.setdefault("afterstate_critic", checkpoint.get("afterstate_critic"))
+    sees_values = need_critic(record.get("network", {}).get("planes", ()))
+    if sees_values and "afterstate_critic" not in record:
+        if "afterstate_critic" not in checkpoint:
+            raise ValueError(f"the {name} agent sees values: afterstate_critic is missing")
+        record["afterstate_critic"] = checkpoint["afterstate_critic"]
     return record
+
+
+def check_weights(record: Mapping[str, Any], name: str) -> Network:
+    """Return the shape of an agent's network; refuse weights that do not fit it.
+
+    It takes no memory for the network, whose shape may be that of a damaged file.
+
+    Args:
+        record: of a learned agent, with its critic's weights or without.
+        name: of the agent.
+
+    Raises:
+        ValueError: naming the first tensor that is missing, unknown or of another shape or type.
+    """
+    try:
+        network = Network(**record["network"])
+        weights = record["actor_state_dict"]
+        if network.layers > len(weights):
+            raise ValueError(f"{network.layers} layers need more than {len(weights)} tensors")
+        with torch.device("meta"):
+            actor = make_actor(name, record["network"], "meta")
+            check_alike(weights, actor.state_dict(), "actor_state_dict")
+            if "critic_state_dict" in record:
+                critic = make_critic(name, record["network"], "meta", actor)
+                check_alike(record["critic_state_dict"], critic.state_dict(), "critic_state_dict")
+    except KeyError as error:
+        raise ValueError(f"the {name} agent: {error.args[0]} is missing") from None
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the {name} agent's weights do not match its network: {error}") from None
+    return network

@@ -22,8 +22,10 @@ from torch.utils._pytree import tree_map
 import marl_pack
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.learning.form import check_alike, check_form, check_keys
 from marl_pack.agents.learning.logging import IterationLogger, Progress
 from marl_pack.agents.learning.ppo import PackingPPO
+from marl_pack.agents.learning.resuming import check_generator, checked_optimizer
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice
 from marl_pack.agents.networks.trunk import Network, widen
 from marl_pack.agents.policy import Placement, Policy
@@ -235,12 +237,13 @@ class Runner(OnPolicyRunner):
         """
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
-            if "critic_state_dict" not in agent:
+            if "critic_state_dict" not in agent or "network" not in agent:
                 raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
-            new, old = (
-                Network(**network)
-                for network in (self.cfg["agents"][name]["network"], agent["network"])
-            )
+            try:
+                old = checkpoints.check_weights(agent, name)
+            except ValueError as error:
+                raise ValueError(f"init: {error}") from None
+            new = Network(**self.cfg["agents"][name]["network"])
             more = set(old.planes) <= set(new.planes)
             needed = asdict(new) | ({"planes": old.planes} if more else {})
             if other := {key: v for key, v in asdict(old).items() if needed[key] != v}:
@@ -252,8 +255,12 @@ class Runner(OnPolicyRunner):
                 weights = agent[f"{part}_state_dict"]
                 orientations = AGENT_KINDS[name].orientations
                 getattr(ppo, part).load_state_dict(widen(weights, old, new, orientations))
-        if "afterstate_critic" in checkpoint:  # else it has new weights
-            self.alg.load_afterstate_critic(checkpoint["afterstate_critic"])
+        if "afterstate_critic" in checkpoint and self.alg.afterstates is not None:
+            # Else it has new weights.
+            weights = checkpoint["afterstate_critic"]
+            own_critic = self.alg.afterstates.critic.state_dict()
+            check_alike(weights, own_critic, "init: afterstate_critic")
+            self.alg.load_afterstate_critic(weights)
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Resume exactly from the checkpoint of a run with the same settings.
@@ -274,16 +281,16 @@ class Runner(OnPolicyRunner):
             raise ValueError(
                 f"{self.gpu_world_size} processes: the run needs {len(states)}, as it had"
             )
+        own = states[self.gpu_global_rank]
         try:
-            self.alg.load(dict(checkpoint) | {"learners": checkpoint["agents"]}, None, True)
+            loaded = self._checked(checkpoint, own)
+            self.alg.load(loaded | {"learners": loaded["agents"]}, None, True)
             if self.alg.afterstates is not None:
-                own_critic = states[self.gpu_global_rank]["afterstates"]
-                self.alg.afterstates.load_state_dict(own_critic)
-        except (RuntimeError, KeyError, TypeError) as error:
+                self.alg.afterstates.load_state_dict(own["afterstates"])
+        except ValueError as error:
             raise ValueError(f"the checkpoint does not match its own settings: {error}") from None
         self.current_learning_iteration = checkpoint["iter"] + 1
         self.evaluations = list(checkpoint["evaluations"])
-        own = states[self.gpu_global_rank]
         self.env.game.load_state_dict(own["game"])
         for name in LOGGER_STATE:
             value = own["logger"][name]
@@ -293,6 +300,61 @@ class Runner(OnPolicyRunner):
         torch.set_rng_state(own["random"]["cpu"].cpu())
         if "cuda" in own["random"]:
             torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
+
+    def _checked(self, checkpoint: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a checkpoint that this run may continue, the optimisers' settings this run's own.
+
+        The game and the critic's rollouts check their own parts as they load them.
+
+        Args:
+            checkpoint: as for :meth:`resume`.
+            state: this process's, of the checkpoint's.
+
+        Raises:
+            ValueError: naming the first value that this run would not have written.
+        """
+        expected = self.checkpoint() | {"state": self.state()}
+        loaded = dict(checkpoint) | {"state": state, "agents": dict(checkpoint["agents"])}
+        check_keys(loaded, list(expected), "", also=("infos",))
+        progress = ("iter", "items", "seconds", "schedule_iteration")
+        check_alike({k: loaded[k] for k in progress}, {k: expected[k] for k in progress}, "")
+        done = loaded["iter"] + 1
+        a_step = self.env.num_envs * self.gpu_world_size
+        items = done * a_step * self.cfg["num_steps_per_env"]
+        if (loaded["schedule_iteration"], loaded["items"]) != (done, items):
+            raise ValueError(
+                f"iter = {loaded['iter']} needs schedule_iteration = {done} and items = {items}, "
+                f"not {loaded['schedule_iteration']} and {loaded['items']}"
+            )
+        for k, row in enumerate(loaded["evaluations"]):
+            for key in ("utilization", *COMPARABLE):
+                if not isinstance(row.get(key), int | float):
+                    raise ValueError(f"evaluations.{k}.{key}: needs a number")
+        for name, ppo in self.alg.learners.items():
+            where = f"agents.{name}"
+            record, own = checkpoints.agent_of(loaded, name), expected["agents"][name]
+            parts = [part for part in own if part != "teacher"]
+            check_keys(record, parts, where, also=("teacher",))
+            if checkpoints.check_weights(record, name) != Network(**own["network"]):
+                raise ValueError(f"{where}.network: is not that of config.{name}")
+            optimizer = checked_optimizer(
+                record["optimizer_state_dict"], ppo.optimizer, f"{where}.optimizer_state_dict"
+            )
+            loaded["agents"][name] = record | {"optimizer_state_dict": optimizer}
+        if self.alg.afterstates is not None:
+            key = "afterstate_critic"
+            check_alike(loaded[key], expected[key], key)
+            key = "afterstate_optimizer"
+            loaded[key] = checked_optimizer(loaded[key], self.alg.afterstates.optimizer, key)
+        check_keys(state, list(expected["state"]), "state")
+        check_alike(state["random"], expected["state"]["random"], "state.random")
+        check_generator(state["random"]["cpu"], "state.random.cpu")
+        logger, own_logger = state["logger"], expected["state"]["logger"]
+        check_alike(logger, own_logger, "state.logger")
+        check_form({name: logger[name] for name in LOGGER_BUFFERS}, {str: [float]}, "state.logger")
+        if logger["tot_timesteps"] != items:
+            raise ValueError(f"state.logger.tot_timesteps: needs {items}")
+        return loaded
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
         """Return the current policy, in which each agent takes its most probable action."""

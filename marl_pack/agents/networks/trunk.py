@@ -16,6 +16,10 @@ from torch import Tensor, nn
 from marl_pack import renamed
 from marl_pack.agents.layers import initialized
 from marl_pack.agents.networks.planes import PLANES, Observation, channel_names, input_channels
+from marl_pack.checks import shown, whole_number
+
+LARGEST = 2**15 - 1
+"""The largest number in a network's shape: the longest side of a bin."""
 
 
 @dataclass
@@ -47,13 +51,21 @@ class Network:
 
     def __post_init__(self) -> None:
         for name in ("channels", "layers", "dilation", "hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"network: {name} = {getattr(self, name)}, needs 1 or more")
+            whole_number(getattr(self, name), f"network: {name}", 1, LARGEST)
+        for name in ("residual", "shortcut", "context", "share_trunk"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"network: {name} = {shown(getattr(self, name))}: true or false")
+        if not isinstance(self.planes, list | tuple) or not all(
+            isinstance(plane, str) for plane in self.planes
+        ):
+            raise ValueError(f"network: planes = {shown(self.planes)}: needs a list of names")
         for plane in self.planes:
             renamed.refuse_old(plane, renamed.PLANES, "network: plane")
         unknown = [plane for plane in self.planes if plane not in PLANES]
         if unknown or len(set(self.planes)) < len(self.planes):
-            raise ValueError(f"network: planes {self.planes}: any of {', '.join(PLANES)}, once")
+            raise ValueError(
+                f"network: planes {shown(self.planes)}: any of {', '.join(PLANES)}, once"
+            )
 
 
 Network.__doc__ = (Network.__doc__ or "").replace("{planes}", ", ".join(PLANES))

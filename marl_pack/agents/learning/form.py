@@ -1,0 +1,195 @@
+"""Check the form of what a file holds: plain values and tensors, of known types and shapes.
+
+Nothing here knows what a checkpoint means (:mod:`marl_pack.agents.learning.checkpoint`).
+"""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from marl_pack.checks import shown
+
+MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 20, 32, 4096
+"""Limits of a file: number of its values, how deep they are nested, and a text's characters."""
+LARGEST_WHOLE = 1 << 64
+"""Whole numbers are smaller than this."""
+
+NAMES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
+    Tensor: "a tensor", dict: "a mapping", list: "a list", type(None): "null",
+}  # fmt: skip
+"""What a value of a type is called in messages."""
+
+
+class Plain:
+    """A copy of untrusted values in which only plain values and ordinary tensors are left.
+
+    Mappings become dicts, and subclasses of tensors become tensors. A value may be shared, so a
+    small file can describe many: their number, depth and memory are limited.
+
+    Args:
+        most_bytes: of all tensors together.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self.bytes, self.values = most_bytes, MOST_VALUES
+
+    def copy(self, value: Any, where: str = "", depth: int = 0) -> Any:
+        """Return the copy of a value.
+
+        Args:
+            value: to copy.
+            where: names it, for messages.
+            depth: how deep it is nested.
+
+        Raises:
+            ValueError: naming what is not plain, not finite, or too much.
+        """
+        self.values -= 1
+        if self.values < 0 or depth > DEEPEST:
+            raise ValueError(f"{where[:LONGEST_TEXT]}: too many values, or nested too deeply")
+        if isinstance(value, Tensor):
+            return self._tensor(value, where)
+        if isinstance(value, Mapping):
+            return {
+                self._key(key, where): self.copy(item, _below(where, key), depth + 1)
+                for key, item in value.items()
+            }
+        if type(value) in (list, tuple):
+            return type(value)(
+                [self.copy(item, _below(where, k), depth + 1) for k, item in enumerate(value)]
+            )
+        return self._single(value, where)
+
+    def _key(self, key: Any, where: str) -> Any:
+        """Return a key of a mapping, a text or a whole number."""
+        if type(key) not in (str, int):
+            raise ValueError(f"{where}: has a key that is neither a text nor a whole number")
+        return self._single(key, f"{where}: a key")
+
+    @staticmethod
+    def _single(value: Any, where: str) -> Any:
+        """Return a value that is not made of others."""
+        if type(value) is str:
+            if len(value) > LONGEST_TEXT:
+                raise ValueError(f"{where}: a text of more than {LONGEST_TEXT} characters")
+            if any(unicodedata.category(character) in ("Cc", "Cs") for character in value):
+                raise ValueError(f"{where}: a text with control characters, {shown(value)}")
+        elif type(value) is int:
+            if abs(value) >= LARGEST_WHOLE:
+                raise ValueError(f"{where}: {shown(value)} is too large, needs 64 bits")
+        elif type(value) is float:
+            if not math.isfinite(value):
+                raise ValueError(f"{where}: is {value}, needs a finite number")
+        elif value is not None and type(value) is not bool:
+            raise ValueError(f"{where}: a {type(value).__name__}, needs a tensor or a plain value")
+        return value
+
+    def _tensor(self, value: Tensor, where: str) -> Tensor:
+        """Return a tensor without the traits that a file could give it."""
+        if value.layout != torch.strided or value.is_quantized or value.is_meta:
+            raise ValueError(f"{where}: needs an ordinary dense tensor")
+        self.bytes -= value.numel() * value.element_size()
+        if self.bytes < 0:
+            raise ValueError(f"{where}: the tensors take more memory than the file")
+        tensor = value.detach().as_subclass(Tensor).resolve_conj().resolve_neg()
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{where}: has numbers that are not finite")
+        return tensor
+
+
+def _below(where: str, key: object) -> str:
+    """Return the name of a value in another one."""
+    name = key if isinstance(key, str) and len(key) <= LONGEST_TEXT else shown(key)
+    return f"{where}.{name}" if where else str(name)
+
+
+Form = Any
+"""A form of values: a type, a tuple of types, a dict from keys to forms, from a type of keys to a
+form, or a list of one form (for each entry) or of several (one for each entry)."""
+
+
+def check_form(value: Any, form: Form, where: str) -> None:
+    """Refuse a value that has another form; keys that the form does not name are left alone.
+
+    Raises:
+        ValueError: naming the first value that is wrong, and what would be right.
+    """
+    if isinstance(form, dict):
+        _check_type(value, dict, where)
+        for key, item in value.items():
+            own = form.get(key, form.get(type(key)))
+            if own is not None:
+                check_form(item, own, _below(where, key))
+            elif str not in form and int in form:
+                raise ValueError(f"{where}: has the key {shown(key)}, needs whole numbers")
+    elif isinstance(form, list):
+        _check_type(value, list, where)
+        if len(form) > 1 and len(value) != len(form):
+            raise ValueError(f"{where}: has {len(value)} entries, needs {len(form)}")
+        for k, item in enumerate(value):
+            check_form(item, form[k if len(form) > 1 else 0], _below(where, k))
+    else:
+        _check_type(value, form, where)
+
+
+def _check_type(value: Any, form: type | tuple[type, ...], where: str) -> None:
+    """Refuse a value of another type; a whole number is a number, a tuple is a list."""
+    types = form if isinstance(form, tuple) else (form,)
+    own = {float: (float, int), list: (list, tuple), dict: (dict, OrderedDict)}
+    if not any(type(value) in own.get(t, (t,)) for t in types):
+        needs = " or ".join(NAMES[t] for t in types)
+        raise ValueError(f"{where}: needs {needs}, not {described(value)}")
+
+
+def described(value: Any) -> str:
+    """Return a few words for a value: a tensor by its shape."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
+    return shown(value)
+
+
+def check_alike(value: Any, own: Any, where: str) -> None:
+    """Refuse a value that differs in form from another: in keys, types, dtypes or shapes.
+
+    Args:
+        value: to check.
+        own: a value of the right form; what it holds does not matter.
+        where: names the value, for messages.
+
+    Raises:
+        ValueError: naming the first value that is wrong, and what would be right.
+    """
+    if isinstance(own, Tensor):
+        if not isinstance(value, Tensor) or (value.dtype, value.shape) != (own.dtype, own.shape):
+            raise ValueError(f"{where}: is {described(value)}, needs {described(own)}")
+    elif isinstance(own, Mapping):
+        _check_type(value, dict, where)
+        check_keys(value, list(own), where)
+        for key, item in own.items():
+            check_alike(value[key], item, _below(where, key))
+    else:
+        _check_type(value, float if type(own) is int else type(own), where)
+
+
+def check_keys(
+    value: Mapping[Any, Any], keys: Sequence[Any], where: str, also: Sequence[Any] = ()
+) -> None:
+    """Refuse a mapping that lacks one of the keys or has others, but for those of ``also``.
+
+    Raises:
+        ValueError: naming the first key that is missing or unknown.
+    """
+    for key in keys:
+        if key not in value:
+            raise ValueError(f"{_below(where, key)} is missing")
+    for key in value:
+        if key not in keys and key not in also:
+            raise ValueError(f"{_below(where, key)} is unknown")
