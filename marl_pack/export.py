@@ -141,6 +141,9 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
     if form == "rsl_rl":
         if "critic_state_dict" not in agent:
             return f"{name}: frozen, so it has no critic that rsl_rl could load"
+        if "optimizer_state_dict" not in agent:
+            raise ValueError(f"agents.{name}.optimizer_state_dict is missing")
+        checkpoints.check_weights(agent, name)
         path = folder / f"{name}.pt"
         checkpoints.write(path, {k: v for k, v in agent.items() if k != "teacher"})
         return f"{path}: for rsl_rl's PPO.load"

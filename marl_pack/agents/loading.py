@@ -35,9 +35,6 @@ from marl_pack.agents.search import Planner, SearchSettings
 from marl_pack.game.spec import GameSpec
 from marl_pack.items import Stream
 
-NAMES = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
-"""Heuristics that can play an agent, by the agent's name."""
-
 
 class Loader:
     """A loader of agents that play together and share what is computed once a turn.
@@ -259,9 +256,9 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError, FileNotFoundError: if it is none of these.
     """
-    if source in NAMES[name]:
+    if source in checkpoints.HEURISTICS[name]:
         return {"name": source}
-    checkpoint = checkpoints.read(_path(source, NAMES[name]))
+    checkpoint = checkpoints.read(_path(source, checkpoints.HEURISTICS[name]))
     with _named(source):
         return checkpoints.agent_record(checkpoint, name)
 

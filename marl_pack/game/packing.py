@@ -212,7 +212,8 @@ class Packing:
         tensors = dict(tensors)
         for name, own in self._origin().items():
             given = tensors.pop(name, own)  # the games are played again in any case
-            if not isinstance(given, Tensor) or not torch.equal(given.cpu(), own):
+            same = isinstance(given, Tensor) and given.dtype == own.dtype
+            if not same or not torch.equal(given.cpu(), own):
                 what = name.removesuffix("_fingerprint")
                 changed = "; was their file changed?" if what == "items" else ""
                 raise ValueError(f"state of another game: needs the {what} of this game{changed}")

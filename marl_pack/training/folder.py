@@ -13,10 +13,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 import marl_pack
 from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.learning.resuming import check_progress
+from marl_pack.agents.loading import trained_game
 from marl_pack.config import Config, ConfigError, from_dict, parse
 from marl_pack.files import write_atomically
 
@@ -27,7 +30,8 @@ MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
 def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
     """Write the history of evaluations as CSV."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(history[-1]))
+    # An earlier version may have written other columns.
+    writer = csv.DictWriter(text, list(history[-1]), extrasaction="ignore")
     writer.writeheader()
     writer.writerows(history)
     write_atomically(path, lambda file: file.write(text.getvalue().encode()))
@@ -100,12 +104,33 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
                 f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
                 "output.*, evaluation.* and ppo.max_iterations may change"
             )
+    _check_size(own, checkpoint)
     done = checkpoint["iter"] + 1
     if config.ppo.max_iterations < min(done, own.ppo.max_iterations):
         raise ConfigError(
             f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
         )
     return config, checkpoint
+
+
+def _check_size(config: Config, checkpoint: Mapping[str, Any]) -> None:
+    """Refuse settings that are not those of the games in a checkpoint, before these are made.
+
+    Raises:
+        ConfigError: naming what is wrong.
+    """
+    states = checkpoint.get("state")
+    if not isinstance(states, list):  # the runner says why that is not enough
+        return
+    ppo = config.ppo
+    try:
+        trained_game(checkpoint)
+        check_progress(checkpoint, len(states) * ppo.num_envs * ppo.num_steps_per_env)
+    except ValueError as error:
+        raise ConfigError(f"--resume: {error}") from None
+    for state in states:
+        if state.get("game", {}).get("t", torch.empty(0)).numel() != ppo.num_envs:
+            raise ConfigError(f"--resume: ppo.num_envs = {ppo.num_envs}: the state has others")
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

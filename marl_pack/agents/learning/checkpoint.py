@@ -22,17 +22,24 @@ Files of format 1 are migrated (:mod:`marl_pack.agents.learning.migration`).
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learning import migration
-from marl_pack.agents.learning.form import Plain, check_alike, check_form
+from marl_pack.agents.learning.form import (
+    Plain,
+    check_alike,
+    check_form,
+    check_no_tensors,
+    described,
+)
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
-from marl_pack.agents.networks.kinds import AGENT_KINDS
+from marl_pack.agents.networks.kinds import AGENT_KINDS, ORIENTATION, PLACEMENT
 from marl_pack.agents.networks.planes import need_critic
 from marl_pack.agents.networks.trunk import Network
 from marl_pack.checks import shown, whole_number
@@ -42,6 +49,9 @@ FORMAT = 2
 MOST_SHARED = 4
 """How often the same tensor may stand in a checkpoint, on average."""
 LATEST, BEST = "latest.pt", "best.pt"
+
+HEURISTICS = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
+"""Heuristics that can play an agent, by the agent's name."""
 
 NOTHING = type(None)
 _WEIGHTS = {str: Tensor}
@@ -151,24 +161,31 @@ def _checked(content: Any, size: int) -> dict[str, Any]:
     checkpoint: dict[str, Any] = Plain(MOST_SHARED * size).copy(content)
     unresumable = isinstance(checkpoint.get("state"), str)  # the reason why
     check_form({k: v for k, v in checkpoint.items() if k != "state" or not unresumable}, FORM, "")
+    check_no_tensors(checkpoint["config"], "config")
     for key, low in (("iter", -1), ("items", 0)):
         whole_number(checkpoint[key], key, low)
     unknown = [name for name in checkpoint["agents"] if name not in AGENT_KINDS]
     if unknown:
         raise ValueError(f"agents: {shown(unknown[0])} is none of {', '.join(AGENT_KINDS)}")
+    if checkpoint["format"] == 1:
+        checkpoint = migration.from_format_1(checkpoint)
     for name, agent in checkpoint["agents"].items():
-        _check_player(agent, f"agents.{name}")
-        for teacher in agent.keys() & {"teacher", "imitated"}:
-            _check_player(agent[teacher], f"agents.{name}.{teacher}")
-    return migration.from_format_1(checkpoint) if checkpoint["format"] == 1 else checkpoint
+        _check_player(agent, name, f"agents.{name}")
+        if "teacher" in agent:
+            _check_player(agent["teacher"], name, f"agents.{name}.teacher")
+    return checkpoint
 
 
-def _check_player(record: Mapping[str, Any], where: str) -> None:
+def _check_player(record: Mapping[str, Any], agent: str, where: str) -> None:
     """Refuse the record of an agent that has neither a heuristic's name nor a network."""
-    if "name" not in record:
-        for part in ("network", "actor_state_dict"):
-            if part not in record:
-                raise ValueError(f"{where}.{part} is missing")
+    if "name" in record:
+        names = HEURISTICS.get(agent, ())
+        if record["name"] not in names:
+            raise ValueError(f"{where}.name: {shown(record['name'])} is none of {', '.join(names)}")
+        return
+    for part in ("network", "actor_state_dict"):
+        if part not in record:
+            raise ValueError(f"{where}.{part} is missing")
 
 
 def agent_of(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -211,7 +228,7 @@ def check_weights(record: Mapping[str, Any], name: str) -> Network:
     It takes no memory for the network, whose shape may be that of a damaged file.
 
     Args:
-        record: of a learned agent, with its critic's weights or without.
+        record: of a learned agent, with the state of its critic and its optimiser or without.
         name: of the agent.
 
     Raises:
@@ -228,8 +245,20 @@ def check_weights(record: Mapping[str, Any], name: str) -> Network:
             if "critic_state_dict" in record:
                 critic = make_critic(name, record["network"], "meta", actor)
                 check_alike(record["critic_state_dict"], critic.state_dict(), "critic_state_dict")
+                parameters = [*actor.parameters(), *critic.parameters()]
+                _check_moments(record.get("optimizer_state_dict", {}), parameters)
     except KeyError as error:
         raise ValueError(f"the {name} agent: {error.args[0]} is missing") from None
     except (ValueError, TypeError, RuntimeError) as error:
         raise ValueError(f"the {name} agent's weights do not match its network: {error}") from None
     return network
+
+
+def _check_moments(state: Mapping[str, Any], parameters: Sequence[Tensor]) -> None:
+    """Refuse an optimiser's state that is not of these parameters, which it numbers in order."""
+    for k, values in state.get("state", {}).items():
+        for key, value in values.items():
+            own = parameters[k].shape if k in range(len(parameters)) else "none"
+            if isinstance(value, Tensor) and value.dim() and value.shape != own:
+                where = f"optimizer_state_dict.state.{k}.{key}"
+                raise ValueError(f"{where}: is {described(value)}, its weight is {own}")

@@ -16,8 +16,10 @@ from torch import Tensor
 
 from marl_pack.checks import shown
 
-MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 20, 32, 4096
+MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 18, 32, 4096
 """Limits of a file: number of its values, how deep they are nested, and a text's characters."""
+LONGEST_NAME = 60
+"""Characters of a key that a message shows."""
 LARGEST_WHOLE = 1 << 64
 """Whole numbers are smaller than this."""
 
@@ -54,7 +56,7 @@ class Plain:
         """
         self.values -= 1
         if self.values < 0 or depth > DEEPEST:
-            raise ValueError(f"{where[:LONGEST_TEXT]}: too many values, or nested too deeply")
+            raise ValueError(f"{where}: too many values, or nested too deeply")
         if isinstance(value, Tensor):
             return self._tensor(value, where)
         if isinstance(value, Mapping):
@@ -64,7 +66,7 @@ class Plain:
             }
         if type(value) in (list, tuple):
             return type(value)(
-                [self.copy(item, _below(where, k), depth + 1) for k, item in enumerate(value)]
+                [self.copy(item, f"{where}.{k}", depth + 1) for k, item in enumerate(value)]
             )
         return self._single(value, where)
 
@@ -107,8 +109,8 @@ class Plain:
 
 def _below(where: str, key: object) -> str:
     """Return the name of a value in another one."""
-    name = key if isinstance(key, str) and len(key) <= LONGEST_TEXT else shown(key)
-    return f"{where}.{name}" if where else str(name)
+    name = key if type(key) is str and len(key) <= LONGEST_NAME else shown(key)
+    return f"{where}.{name}" if where else name
 
 
 Form = Any
@@ -138,6 +140,22 @@ def check_form(value: Any, form: Form, where: str) -> None:
             check_form(item, form[k if len(form) > 1 else 0], _below(where, k))
     else:
         _check_type(value, form, where)
+
+
+def check_no_tensors(value: Any, where: str) -> None:
+    """Refuse a tensor in nested values.
+
+    Raises:
+        ValueError: naming the first one.
+    """
+    if isinstance(value, Tensor):
+        raise ValueError(f"{where}: is a tensor, needs a plain value")
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            check_no_tensors(item, _below(where, key))
+    elif isinstance(value, list | tuple):
+        for k, item in enumerate(value):
+            check_no_tensors(item, _below(where, k))
 
 
 def _check_type(value: Any, form: type | tuple[type, ...], where: str) -> None:

@@ -14,7 +14,26 @@ from marl_pack.agents.learning.form import check_alike, check_keys
 from marl_pack.checks import real_number, shown
 
 
-def checked_optimizer(state: Mapping[str, Any], optimizer: Optimizer, where: str) -> dict[str, Any]:
+def check_progress(checkpoint: Mapping[str, Any], items: int) -> None:
+    """Refuse a checkpoint whose counters do not belong to one point of a run.
+
+    Args:
+        checkpoint: to resume from.
+        items: of each iteration, in all processes.
+
+    Raises:
+        ValueError: naming the counter and what it needs to be.
+    """
+    done = checkpoint["iter"] + 1
+    for key, needed in (("schedule_iteration", done), ("items", done * items)):
+        if checkpoint.get(key) != needed:
+            value = shown(checkpoint.get(key))
+            raise ValueError(f"{key} = {value}: needs {needed} after {done} iterations")
+
+
+def checked_optimizer(
+    state: Mapping[str, Any], optimizer: Optimizer, where: str, begun: bool
+) -> dict[str, Any]:
     """Return an optimiser's state that another one with the same settings may load.
 
     Only the learning rate changes during a run. Settings that other versions of torch do not write
@@ -24,6 +43,7 @@ def checked_optimizer(state: Mapping[str, Any], optimizer: Optimizer, where: str
         state: a ``state_dict``.
         optimizer: to load it.
         where: names the state, for messages.
+        begun: whether it has learned, so that there are moments.
 
     Raises:
         ValueError: naming the first value that the optimiser would not have written.
@@ -44,7 +64,7 @@ def checked_optimizer(state: Mapping[str, Any], optimizer: Optimizer, where: str
         groups.append(ours | {"lr": group["lr"]})
     moments = state["state"]
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
-    if moments:
+    if moments or (begun and _after_a_step(optimizer, weights[0])):
         check_keys(moments, range(len(weights)), f"{where}.state")
     for k, values in moments.items():
         name = f"{where}.state.{k}"

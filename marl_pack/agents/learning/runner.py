@@ -25,7 +25,7 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.form import check_alike, check_form, check_keys
 from marl_pack.agents.learning.logging import IterationLogger, Progress
 from marl_pack.agents.learning.ppo import PackingPPO
-from marl_pack.agents.learning.resuming import check_generator, checked_optimizer
+from marl_pack.agents.learning.resuming import check_generator, check_progress, checked_optimizer
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice
 from marl_pack.agents.networks.trunk import Network, widen
 from marl_pack.agents.policy import Placement, Policy
@@ -114,6 +114,7 @@ class Runner(OnPolicyRunner):
         self.current_learning_iteration = it = progress.iteration - 1
         self.show(progress)
         not_finite = [key for key, value in progress.losses.items() if not math.isfinite(value)]
+        not_finite += self._agents_with_weights_not_finite()
         if not_finite:
             raise TrainingDivergedError(
                 f"training diverged in iteration {progress.iteration}: {', '.join(not_finite)} not "
@@ -128,6 +129,20 @@ class Runner(OnPolicyRunner):
             self._write_latest()
         if stop and not final:
             raise RunInterruptedError
+
+    def _agents_with_weights_not_finite(self) -> list[str]:
+        """Return the weights that are not finite, as ``name/weights`` of their learners."""
+        return [
+            f"{name}/weights"
+            for name, ppo in self.alg.learners.items()
+            if not torch.stack(
+                [
+                    weight.isfinite().all()
+                    for network in (ppo.actor, ppo.critic)
+                    for weight in network.parameters()
+                ]
+            ).all()
+        ]
 
     def _write_latest(self) -> None:
         """Write the checkpoint to resume from; every process takes part."""
@@ -318,14 +333,9 @@ class Runner(OnPolicyRunner):
         check_keys(loaded, list(expected), "", also=("infos",))
         progress = ("iter", "items", "seconds", "schedule_iteration")
         check_alike({k: loaded[k] for k in progress}, {k: expected[k] for k in progress}, "")
-        done = loaded["iter"] + 1
-        a_step = self.env.num_envs * self.gpu_world_size
-        items = done * a_step * self.cfg["num_steps_per_env"]
-        if (loaded["schedule_iteration"], loaded["items"]) != (done, items):
-            raise ValueError(
-                f"iter = {loaded['iter']} needs schedule_iteration = {done} and items = {items}, "
-                f"not {loaded['schedule_iteration']} and {loaded['items']}"
-            )
+        steps = self.cfg["num_steps_per_env"]
+        check_progress(loaded, self.env.num_envs * self.gpu_world_size * steps)
+        begun = loaded["iter"] >= 0
         for k, row in enumerate(loaded["evaluations"]):
             for key in ("utilization", *COMPARABLE):
                 if not isinstance(row.get(key), int | float):
@@ -338,22 +348,25 @@ class Runner(OnPolicyRunner):
             if checkpoints.check_weights(record, name) != Network(**own["network"]):
                 raise ValueError(f"{where}.network: is not that of config.{name}")
             optimizer = checked_optimizer(
-                record["optimizer_state_dict"], ppo.optimizer, f"{where}.optimizer_state_dict"
+                record["optimizer_state_dict"],
+                ppo.optimizer,
+                f"{where}.optimizer_state_dict",
+                begun,
             )
             loaded["agents"][name] = record | {"optimizer_state_dict": optimizer}
         if self.alg.afterstates is not None:
             key = "afterstate_critic"
             check_alike(loaded[key], expected[key], key)
             key = "afterstate_optimizer"
-            loaded[key] = checked_optimizer(loaded[key], self.alg.afterstates.optimizer, key)
+            loaded[key] = checked_optimizer(loaded[key], self.alg.afterstates.optimizer, key, begun)
         check_keys(state, list(expected["state"]), "state")
         check_alike(state["random"], expected["state"]["random"], "state.random")
         check_generator(state["random"]["cpu"], "state.random.cpu")
         logger, own_logger = state["logger"], expected["state"]["logger"]
         check_alike(logger, own_logger, "state.logger")
         check_form({name: logger[name] for name in LOGGER_BUFFERS}, {str: [float]}, "state.logger")
-        if logger["tot_timesteps"] != items:
-            raise ValueError(f"state.logger.tot_timesteps: needs {items}")
+        if logger["tot_timesteps"] != loaded["items"]:
+            raise ValueError(f"state.logger.tot_timesteps: needs {loaded['items']}")
         return loaded
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
