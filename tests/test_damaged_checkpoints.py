@@ -53,10 +53,10 @@ def test_any_changed_value_is_refused_in_one_line_or_does_no_harm(
     torch.save(content, whole)
     assert set(outcomes(whole, content["config"]).values()) == {"taken"}
     refused = 0
-    for _, changed in islice(cases(4, content), 14):
+    for _, changed in islice(cases(4, content), 10):
         torch.save(changed, path)
         refused += set(outcomes(path, content["config"]).values()) != {"taken"}
-    assert refused > 7
+    assert refused > 5
 
 
 def test_weights_that_are_not_finite_are_refused_by_every_command_and_named(

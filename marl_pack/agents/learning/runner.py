@@ -233,8 +233,12 @@ class Runner(OnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict[str, Any] | None:
-        """Load networks and optimisers from a checkpoint, to train from its next iteration on."""
-        checkpoint = checkpoints.read(path, map_location or self.device)
+        """Load networks and optimisers from a checkpoint, to train from its next iteration on.
+
+        Raises:
+            ValueError: if the checkpoint does not match this run.
+        """
+        checkpoint = self._checked_learners(checkpoints.read(path, map_location or self.device))
         if self.alg.load(checkpoint | {"learners": checkpoint["agents"]}, load_cfg, strict):
             self.current_learning_iteration = checkpoint["iter"] + 1
         infos: dict[str, Any] | None = checkpoint.get("infos")
@@ -329,17 +333,34 @@ class Runner(OnPolicyRunner):
             ValueError: naming the first value that this run would not have written.
         """
         expected = self.checkpoint() | {"state": self.state()}
-        loaded = dict(checkpoint) | {"state": state, "agents": dict(checkpoint["agents"])}
+        loaded = dict(checkpoint) | {"state": state}
         check_keys(loaded, list(expected), "", also=("infos",))
         progress = ("iter", "items", "seconds", "schedule_iteration")
         check_alike({k: loaded[k] for k in progress}, {k: expected[k] for k in progress}, "")
         steps = self.cfg["num_steps_per_env"]
         check_progress(loaded, self.env.num_envs * self.gpu_world_size * steps)
-        begun = loaded["iter"] >= 0
         for k, row in enumerate(loaded["evaluations"]):
             for key in ("utilization", *COMPARABLE):
                 if not isinstance(row.get(key), int | float):
                     raise ValueError(f"evaluations.{k}.{key}: needs a number")
+        check_keys(state, list(expected["state"]), "state")
+        check_alike(state["random"], expected["state"]["random"], "state.random")
+        check_generator(state["random"]["cpu"], "state.random.cpu")
+        logger, own_logger = state["logger"], expected["state"]["logger"]
+        check_alike(logger, own_logger, "state.logger")
+        check_form({name: logger[name] for name in LOGGER_BUFFERS}, {str: [float]}, "state.logger")
+        if logger["tot_timesteps"] != loaded["items"]:
+            raise ValueError(f"state.logger.tot_timesteps: needs {loaded['items']}")
+        return self._checked_learners(loaded)
+
+    def _checked_learners(self, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a checkpoint whose networks and optimisers this run may load.
+
+        Args, Raises: as for :meth:`_checked`.
+        """
+        expected, begun = self.checkpoint(), checkpoint["iter"] >= 0
+        loaded = dict(checkpoint) | {"agents": dict(checkpoint["agents"])}
+        check_keys(loaded, list(expected), "", also=list(loaded))
         for name, ppo in self.alg.learners.items():
             where = f"agents.{name}"
             record, own = checkpoints.agent_of(loaded, name), expected["agents"][name]
@@ -359,14 +380,6 @@ class Runner(OnPolicyRunner):
             check_alike(loaded[key], expected[key], key)
             key = "afterstate_optimizer"
             loaded[key] = checked_optimizer(loaded[key], self.alg.afterstates.optimizer, key, begun)
-        check_keys(state, list(expected["state"]), "state")
-        check_alike(state["random"], expected["state"]["random"], "state.random")
-        check_generator(state["random"]["cpu"], "state.random.cpu")
-        logger, own_logger = state["logger"], expected["state"]["logger"]
-        check_alike(logger, own_logger, "state.logger")
-        check_form({name: logger[name] for name in LOGGER_BUFFERS}, {str: [float]}, "state.logger")
-        if logger["tot_timesteps"] != loaded["items"]:
-            raise ValueError(f"state.logger.tot_timesteps: needs {loaded['items']}")
         return loaded
 
     def get_inference_policy(self, device: str | None = None) -> Policy:

@@ -51,7 +51,8 @@ class Network:
 
     def __post_init__(self) -> None:
         for name in ("channels", "layers", "dilation", "hidden"):
-            whole_number(getattr(self, name), f"network: {name}", 1, LARGEST)
+            value = getattr(self, name)
+            whole_number(value, f"network: {name} = {shown(value)}", 1, LARGEST)
         for name in ("residual", "shortcut", "context", "share_trunk"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"network: {name} = {shown(getattr(self, name))}: true or false")
