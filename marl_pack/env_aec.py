@@ -38,6 +38,7 @@ Version history: v0, first release.
 
 from __future__ import annotations
 
+import copy
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
@@ -47,7 +48,6 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
@@ -56,7 +56,8 @@ from pettingzoo.utils.conversions import (
     turn_based_aec_to_parallel_wrapper,
 )
 
-from marl_pack.game.packing import MOST_SKIPPED, Packing
+from marl_pack.checks import real_number, shown, whole_number
+from marl_pack.game.packing import MOST_SEED, Packing
 from marl_pack.game.spec import GameSpec, document, with_options
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
@@ -76,11 +77,12 @@ def env(*, illegal_reward: float = -1.0, **kwargs: Any) -> AECEnv:
             ``illegal="terminate"``).
         **kwargs: of :class:`raw_env`.
     """
+    illegal_reward = real_number(illegal_reward, "illegal_reward")
     environment: AECEnv = raw_env(**kwargs)
     if environment.unwrapped.illegal == "terminate":
         environment = wrappers.TerminateIllegalWrapper(environment, illegal_reward=illegal_reward)
     environment = wrappers.AssertOutOfBoundsWrapper(environment)
-    return wrappers.OrderEnforcingWrapper(environment)
+    return OrderEnforcing(environment)
 
 
 def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
@@ -102,12 +104,61 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
     Raises:
         ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
     """
+    _true_or_false("simultaneous", simultaneous)
     if simultaneous and kwargs.get("illegal") != "repair":
         raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
-    return (aec_to_parallel_wrapper if simultaneous else Turns)(env(**kwargs))
+    return (AtOnce if simultaneous else Turns)(env(**kwargs))
 
 
-class Turns(turn_based_aec_to_parallel_wrapper):
+class Copied:
+    """An environment whose copies continue exactly as it does, and share nothing that changes."""
+
+    def __copy__(self) -> Any:
+        """Return an independent copy: a view of the same game would not be one."""
+        return copy.deepcopy(self)
+
+
+class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
+    """PettingZoo's outermost wrapper: it names calls in a wrong order, and wrong actions."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begin an episode; a refused one changes nothing."""
+        before = self._has_reset, self._has_updated
+        try:
+            super().reset(seed=seed, options=options)
+        except ValueError:
+            self._has_reset, self._has_updated = before
+            raise
+
+    def step(self, action: int | None) -> None:
+        """Play the selected agent's action; None once that agent has ended.
+
+        Raises:
+            ValueError: for an action that is no whole number of its action space.
+        """
+        if self._has_reset and self.agents and action is not None:
+            action = self.unwrapped.check_action(self.agent_selection, action)
+        super().step(action)
+
+    def last(self, observe: bool = True) -> Any:
+        """Return what PettingZoo's ``last`` does; refuse it once no agent is left."""
+        _some_left(self.agents)
+        return super().last(observe)
+
+    def __str__(self) -> str:
+        return str(self.env)
+
+
+class AtOnce(Copied, aec_to_parallel_wrapper):
+    """PettingZoo's view of a whole item a step; a refused step changes nothing."""
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        """Play one action of each agent."""
+        _check_actions(self.unwrapped, self.agents, actions)
+        return super().step(actions)
+
+
+class Turns(Copied, turn_based_aec_to_parallel_wrapper):
     """PettingZoo's turn-by-turn view; every info says whose turn it is, after a reset as well."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -116,6 +167,8 @@ class Turns(turn_based_aec_to_parallel_wrapper):
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Play the acting agent's action; name the next one in every info."""
+        acting = [self.aec_env.agent_selection] if self.agents else []
+        _check_actions(self.unwrapped, acting, actions)
         return self._name_active(*super().step(actions))
 
     def _name_active(self, *returned: Any) -> Any:
@@ -125,8 +178,10 @@ class Turns(turn_based_aec_to_parallel_wrapper):
 
 
 @document(" " * 8)
-class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
+class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
     """One bin, two agents. See the module for agents, spaces, masks, reward and end.
+
+    Copies and pickles continue exactly from the same state; a window stays with its owner.
 
     Args:
         bin_size: (W, D, H) in cells.
@@ -172,25 +227,22 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         illegal: str = "terminate",
         **options: Any,
     ) -> None:
-        EzPickle.__init__(
-            self, bin_size, items, sides=sides, max_cycles=max_cycles, render_mode=render_mode,
-            pad_actions=pad_actions, mask_in=mask_in, illegal=illegal, **options,
-        )  # fmt: skip
         super().__init__()
         _one_of("mask_in", mask_in, ("observation", "info"))
         _one_of("illegal", illegal, ("terminate", "repair"))
         if render_mode is not None:
             _one_of("render_mode", render_mode, RENDER_MODES)
-        if max_cycles is not None and max_cycles < 1:
-            raise ValueError(f"max_cycles = {max_cycles}: needs at least 1, or None for no limit")
+        if max_cycles is not None:
+            max_cycles = whole_number(max_cycles, "max_cycles (None for no limit)", 1)
+        _true_or_false("pad_actions", pad_actions)
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
         self._unit = max(self._game.size)
-        self._episode = -1
-        self._seeded = False
+        self._episode = -1  # of the stream, the last one that was begun
+        self._seed: int | None = None  # of the stream, once it was begun
         self._chosen: int | None = None
         self._read_game()
 
@@ -240,34 +292,38 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
                 [L, 3], or items with attributes.
 
         Raises:
-            ValueError: for impossible items, or if no episode has a legal first item.
+            ValueError: for an impossible seed or items, or if no episode has a legal first item;
+                nothing has changed then.
         """
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"options = {shown(options)}: needs a dict")
         unknown = set(options or {}) - {"items"}
         if unknown:
             # Not an error: PettingZoo's API test sends an option of its own.
             warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
-        if seed is None and not self._seeded:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        episode = self._episode if seed is None else -1
         if seed is not None:
-            self._stream_game.seed, self._seeded, self._episode = int(seed), True, -1
+            seed = whole_number(seed, "seed", 0, MOST_SEED)
+        elif self._seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        else:
+            seed = self._seed
         if options and options.get("items") is not None:
             try:
                 game = Packing(1, items=options["items"], spec=self._spec, auto_reset=False)
             except ValueError as error:
                 raise ValueError(f'options["items"]: {error}') from None
+            if not bool(game.alive):
+                raise ValueError(
+                    f'options["items"]: the first item {game.items.sides[0].tolist()} may be placed '
+                    "nowhere in the empty bin: check orientations, the rule's margin and com_offset"
+                )
         else:
             game = self._stream_game
-            for _ in range(MOST_SKIPPED):  # an episode may be over before it begins
-                self._episode += 1
-                game.reset(first_episode=self._episode)
-                if bool(game.alive):
-                    break
-        if not bool(game.alive):
-            raise ValueError(
-                f"the first item {game.items.sides[0].tolist()} may be placed nowhere in the empty "
-                "bin: check orientations, the rule's margin and com_offset"
-            )
-        self._game = game
+            # An episode may be over before it begins.
+            game.reset(seed, first_episode=episode + 1, skip=True)
+            episode = int(game.episode)
+        self._seed, self._episode, self._game = seed, episode, game
 
         self.agents = list(AGENTS)
         self.agent_selection = ORIENTATION
@@ -284,8 +340,10 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         """Play the selected agent's action; None once that agent has ended.
 
         Raises:
-            ValueError: for an illegal action, unless ``illegal="repair"``.
+            ValueError: for an action that is no whole number of its action space, and for an
+                illegal one, unless ``illegal="repair"``.
         """
+        _some_left(self.agents)
         agent = self.agent_selection
         if self.terminations[agent] or self.truncations[agent]:
             self._was_dead_step(action)
@@ -323,21 +381,42 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         self.terminations = dict.fromkeys(self.agents, ended)
         self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
 
-    def _legal(self, agent: str, action: int | None) -> tuple[int, bool]:
+    def last(self, observe: bool = True) -> Any:
+        """Return observation, reward, ends and info of the agent that acts, as PettingZoo does.
+
+        Raises:
+            ValueError: once no agent is left.
+        """
+        _some_left(self.agents)
+        return super().last(observe)
+
+    def check_action(self, agent: str, action: Any) -> int:
+        """Return an agent's action as an int.
+
+        Raises:
+            ValueError: unless it is a whole number of the agent's action space.
+        """
+        if type(action) in (np.ndarray, torch.Tensor) and action.ndim == 0:
+            action = action.item()
+        return whole_number(action, f"{agent}: action", 0, int(self.action_spaces[agent].n) - 1)
+
+    def _legal(self, agent: str, action: Any) -> tuple[int, bool]:
         """Return the action to play, and whether it had to be repaired."""
-        mask = self.action_mask(agent)
-        if action is None or not 0 <= int(action) < len(mask):
-            raise ValueError(f"{agent}: action {action} is not in 0 … {len(mask) - 1}")
-        if mask[int(action)]:
-            return int(action), False
+        action, mask = self.check_action(agent, action), self.action_mask(agent)
+        if mask[action]:
+            return action, False
         legal = np.flatnonzero(mask)
         if self.illegal != "repair":
             raise ValueError(
                 f"{agent}: action {action} is not legal; {len(legal)} are, see its action_mask"
             )
         if self._chosen is None:
-            return int(legal[np.abs(legal - int(action)).argmin()]), True
-        return self._game.floor.nearest(int(action), legal), True
+            return int(legal[np.abs(legal - action).argmin()]), True
+        return self._game.floor.nearest(action, legal), True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all that a copy or a pickle continues from."""
+        return vars(self) | {"_window": None}
 
     # --- observations -----------------------------------------------------------------------------
 
@@ -449,6 +528,25 @@ class raw_env(AECEnv, EzPickle):  # noqa: N801  # PettingZoo's name for it
         if self._window is not None:
             self._window.close()
             self._window = None
+
+
+def _some_left(agents: Sequence[str]) -> None:
+    """Raise ValueError if no agent is left to act."""
+    if not agents:
+        raise ValueError("no agent is left to act: begin an episode with reset()")
+
+
+def _check_actions(env: raw_env, agents: Sequence[str], actions: Any) -> None:
+    """Raise ValueError unless the actions of ``agents`` are in a mapping, and in their spaces."""
+    for agent in agents:
+        if not isinstance(actions, Mapping) or agent not in actions:
+            raise ValueError(f"actions: needs a dict with the action of {agent}")
+        env.check_action(agent, actions[agent])
+
+
+def _true_or_false(name: str, value: bool) -> None:
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} = {shown(value)}: needs true or false")
 
 
 def _one_of(name: str, value: str, valid: Sequence[str]) -> None:

@@ -64,7 +64,13 @@ class PackingVecEnv(VecEnv):
         Returns:
             The next observation, rewards float32 [G] (Eq. 5), dones uint8 [G] and extras: ``log``
             holds utilization and items of the episodes that have ended.
+
+        Raises:
+            ValueError: unless the actions are int64 [G, 2].
         """
+        if actions.shape != (self.num_envs, self.num_actions):
+            shape = [self.num_envs, self.num_actions]
+            raise ValueError(f"actions {list(actions.shape)}: need int64 {shape}")
         outcome = self.game.place(actions[:, 0], actions[:, 1], check=False)
         ended = outcome.done.nonzero().squeeze(1)
         log = {}

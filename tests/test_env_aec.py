@@ -349,8 +349,70 @@ def test_the_raw_environment_refuses_an_illegal_action() -> None:
     env.step(0)
     with pytest.raises(ValueError, match=r"placement_0: action .* is not legal"):
         env.step(first_illegal(env))
-    with pytest.raises(ValueError, match="not in 0"):
+    with pytest.raises(ValueError, match="action: needs a whole number from 0 to 99, not 100"):
         env.step(100)
+
+
+@pytest.mark.parametrize("illegal", ["terminate", "repair"])
+@pytest.mark.parametrize("kind", [env_aec.raw_env, env_aec.env])
+@pytest.mark.parametrize(
+    "action",
+    [5.99, 1.0, True, "1", None, -1, 6, [1], np.bool_(1), np.float32(1), np.array([1]),
+     np.ma.array(1, mask=True), torch.tensor(1.5), torch.tensor(True), torch.tensor([1])],
+)  # fmt: skip
+def test_an_action_is_a_whole_number_of_its_space(kind: Any, action: Any, illegal: str) -> None:
+    env = kind(illegal=illegal)
+    env.reset(seed=0)
+    before = env.state()
+    if kind is env_aec.env and action is None:
+        pytest.skip("PettingZoo's wrapper asserts that None is for agents that have ended")
+    with pytest.raises(ValueError, match="orientation_0: action: needs a whole number from 0 to 5"):
+        env.step(action)
+    assert (env.state() == before).all()
+    assert env.agent_selection == O
+
+
+@pytest.mark.parametrize("one", [1, np.int8(1), np.array(1), torch.tensor(1)])
+def test_whole_numbers_of_every_type_are_actions(one: Any) -> None:
+    for kind in (env_aec.raw_env, env_aec.env):
+        env = kind()
+        env.reset(seed=0)
+        env.step(one)
+        assert env.unwrapped._chosen == 1
+
+
+def test_actions_of_a_parallel_step_are_checked_before_any_is_played() -> None:
+    for simultaneous in (False, True):
+        env = env_aec.parallel_env(simultaneous=simultaneous, illegal="repair")
+        env.reset(seed=0)
+        before = env.state()
+        for actions in ({}, 5, {P: 1}, {O: 0.5, P: 1}, {O: True, P: 1}):
+            with pytest.raises(ValueError, match=r"action of orientation_0|orientation_0: action"):
+                env.step(actions)
+        if simultaneous:
+            for actions in ({O: 0}, {O: 0, P: 1.5}):
+                with pytest.raises(ValueError, match="placement_0"):
+                    env.step(actions)
+        assert (env.state() == before).all()
+        env.step({O: 0, P: 0})
+
+
+@pytest.mark.parametrize("kind", [env_aec.raw_env, env_aec.env])
+def test_after_the_end_no_agent_is_left_to_act(kind: Any) -> None:
+    env = kind(items=[[5, 5, 5]])
+    env.reset()
+    for action in (0, 0, None, None):
+        env.last()
+        env.step(action)
+    with pytest.raises(ValueError, match=r"no agent is left to act: begin an episode with reset"):
+        env.last()
+    raw = env.unwrapped
+    with pytest.raises(ValueError, match="no agent is left to act"):
+        raw.step(0)
+    with pytest.raises(ValueError, match="no agent is left to act"):
+        env_aec.raw_env().step(0)
+    env.reset()
+    assert env.last()[1:4] == (0, False, False)
 
 
 def test_an_illegal_action_is_repaired_to_the_nearest_legal_one() -> None:
@@ -373,7 +435,8 @@ def test_wrappers_are_in_pettingzoos_order() -> None:
             env = env.env
         return [*out, type(env)]
 
-    outer = [wrappers.OrderEnforcingWrapper, wrappers.AssertOutOfBoundsWrapper]
+    assert issubclass(env_aec.OrderEnforcing, wrappers.OrderEnforcingWrapper)
+    outer = [env_aec.OrderEnforcing, wrappers.AssertOutOfBoundsWrapper]
     assert chain(env_aec.env()) == [*outer, wrappers.TerminateIllegalWrapper, env_aec.raw_env]
     assert chain(env_aec.env(illegal="repair")) == [*outer, env_aec.raw_env]
 
@@ -384,12 +447,15 @@ def test_wrappers_are_in_pettingzoos_order() -> None:
         ({"mask_in": "both"}, "mask_in"),
         ({"illegal": "ignore"}, "illegal"),
         ({"render_mode": "3d"}, "render_mode"),
-        ({"max_cycles": 0}, "max_cycles"),
+        *[({"max_cycles": value}, "max_cycles .*: needs a whole number >= 1")
+          for value in (0, 1.5, 2.0, True, "3")],
+        ({"pad_actions": "no"}, "pad_actions = 'no': needs true or false"),
+        ({"illegal_reward": "-1"}, "illegal_reward: needs a finite number"),
         ({"rule": "hull"}, "unknown stability rule"),
         ({"bin_size": (10, 10, 0)}, "bin size"),
         ({"items": [[11, 11, 11]]}, "row 0"),
     ],
-)
+)  # fmt: skip
 def test_impossible_arguments_are_refused(arguments: dict[str, Any], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         env_aec.env(**arguments)

@@ -13,6 +13,9 @@ from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import check_items
 from marl_pack.stability import RULES, make_rule
 
+NUMBER = "needs a whole number"
+HIDDEN = np.ma.array([[2, 2, 2], [9, 9, 9]], mask=[[0] * 3, [1] * 3])
+
 
 def test_a_game_worked_by_hand() -> None:
     # Bin 4 x 4 x 4 (64 cells). A 4 x 4 x 2 slab on the floor, then a 2 x 2 x 2 cube in a corner,
@@ -245,11 +248,87 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"bin": (40000, 10, 10)}, "at most 32767"),
         ({"margin": 3.0}, "no item that begins an episode"),
         ({"bin": (4, 9, 9), "items": [[9, 2, 2]], "orientations": (0,)}, "no item that begins"),
+        *[({name: value}, rf"^{name}.*{NUMBER}")
+          for name in ("n", "seed", "first_episode") for value in (1.5, 2.0, True, "3", -1)],
+        ({"seed": 2**63}, f"seed: {NUMBER} from 0 to 9223372036854775807"),
+        *[({"max_items": value}, f"max_items = .*{NUMBER}")
+          for value in (2.0, True, "3", np.float64(2), 10**400)],
+        *[({"bin": value}, "bin size .*: needs three whole numbers of cells")
+          for value in ((5, 5.5, 5), (True, 5, 5), ("5", 5, 5), (10**400, 5, 5), "555",
+                        np.ma.array([5, 5, 5], mask=[0, 0, 1]))],
+        *[({"sides": value}, "sides .*: need two whole numbers")
+          for value in ((2.5, 5), (True, 5), ("2", "5"), (2, float("nan")), "25", 5, (5, 2))],
+        *[({"orientations": value}, "orientations = .*: need one or more of 0 … 5")
+          for value in (b"\x00", {0: 1}, np.ma.array([0, 1], mask=[0, 1]), None, 0)],
+        *[({"com_offset": value}, "com_offset")
+          for value in ("000", None, ("0.1", 0, 0), (True, 0, 0), (0.1, 0))],
+        *[({name: 10**400}, f"{name} = .*: needs a finite number") for name in ("alpha", "margin")],
+        ({"thresholds": ["code"]}, "thresholds = .*: one of paper, code"),
+        ({"auto_reset": "no"}, "auto_reset = 'no': needs true or false"),
+        ({"spec": {}}, "spec = {}: needs a GameSpec"),
+        ({"backend": "tensor"}, "backend = 'tensor': needs one of Backend.COMPILED, "),
+        ({"items": HIDDEN}, "items: items: some values are masked"),
+        ({"items": [HIDDEN, [[2, 2, 2]]]}, "items: items: some values are masked"),
+        ({"items": {"items": [[2, 2, 2]], "weights": np.ma.array([1.0], mask=[1])}},
+         "items: weights: some values are masked"),
     ],
-)
+)  # fmt: skip
 def test_impossible_games_are_refused(arguments: dict[str, object], why: str) -> None:
-    with pytest.raises(ValueError, match=why):
+    with pytest.raises(ValueError, match=why) as error:
         Packing(**({"n": 2} | arguments))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize(
+    "choice",
+    [
+        [0, 0, 0], 0, None, np.zeros(3, np.int64), torch.zeros(3), torch.zeros(3, dtype=torch.bool),
+        torch.zeros(3, dtype=torch.int32), torch.zeros(3, dtype=torch.uint8),
+        torch.zeros(2, dtype=torch.int64), torch.zeros(3, 1, dtype=torch.int64),
+        torch.tensor(0), torch.zeros(3, dtype=torch.int64, device="meta"),
+    ],
+)  # fmt: skip
+def test_choices_are_whole_numbers_one_for_each_game(choice: object, backend: Backend) -> None:
+    game, zeros = Packing(3, seed=6, backend=backend), torch.zeros(3, dtype=torch.int64)
+    before = game.state_dict()
+    for play in (
+        lambda: game.orient(choice),
+        lambda: game.orient(choice, check=False),
+        lambda: game.place(choice, zeros),
+        lambda: game.place(zeros, choice),
+        lambda: game.place(zeros, choice, check=False),
+    ):
+        with pytest.raises(ValueError, match=r": needs one whole number for each of 3 games, int64"):
+            play()
+    assert all(torch.equal(value, before[name]) for name, value in game.state_dict().items())
+
+
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize("wrong", [-1, -6, -7, 6, 11, 12, 2**62, -(2**63)])
+def test_an_orientation_out_of_range_is_no_other_one(wrong: int, backend: Backend) -> None:
+    game = Packing(3, seed=6, backend=backend)
+    orientation, cell = torch.tensor([0, wrong, 0]), game.mask[:, 0].flatten(1).int().argmax(1)
+    reason = f"game 1: orientation: needs a whole number from 0 to 5, not {wrong}"
+    with pytest.raises(ValueError, match=reason):
+        game.orient(orientation)
+    with pytest.raises(ValueError, match=rf"game 1: .* in orientation {wrong} may not be placed"):
+        game.place(orientation, cell)
+    with pytest.raises(ValueError, match=reason):
+        game.place(orientation, cell, check=False)
+    assert not game.bins.count.any()
+
+
+@pytest.mark.parametrize(
+    "games", [[0], torch.tensor([True, False]), torch.tensor([0.0]), torch.tensor([2]),
+              torch.tensor([-1]), torch.tensor([[0]])],
+)  # fmt: skip
+def test_games_to_branch_are_numbers_of_games(games: object) -> None:
+    game = Packing(2)
+    with pytest.raises(ValueError, match=r"^games: needs "):
+        game.branch(games)
+    with pytest.raises(ValueError, match=r"^episodes: a stream needs one for each of 1 games"):
+        game.branch(torch.tensor([0]), game.stream)
 
 
 def test_a_large_and_a_flat_bin_are_played() -> None:

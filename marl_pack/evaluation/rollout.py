@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.agents.policy import Policy
+from marl_pack.checks import whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
 
@@ -48,7 +49,11 @@ def play(
         game: (n, first_episode) → n games without ``auto_reset``.
         episodes: how many, E.
         progress: called with the number of episodes that have just ended.
+
+    Raises:
+        ValueError: unless ``episodes`` is a whole number ≥ 1.
     """
+    episodes = whole_number(episodes, "episodes", 1)
     plans: list[Plan] = []
     width, depth, _ = game(1, 0).size
     batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))

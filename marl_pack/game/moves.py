@@ -108,10 +108,9 @@ class Moves:
     def allows(self, orientation: Tensor, cell: Tensor) -> Tensor:
         """Return whether placements (int64 [G] each) are legal, bool [G]; out of range is not."""
         floor = self.floor
-        pair = floor.pair(orientation, cell)
-        near = pair.clamp(0, floor.pairs - 1)
-        legal = self.mask.flatten(1).gather(1, near[:, None]).squeeze(1)
-        return legal & (near == pair) & (cell >= 0) & (cell < floor.cells)
+        near = orientation.clamp(0, len(ORIENTATIONS) - 1), cell.clamp(0, floor.cells - 1)
+        legal = self.mask.flatten(1).gather(1, floor.pair(*near)[:, None]).squeeze(1)
+        return legal & (near[0] == orientation) & (near[1] == cell)
 
     def least(self, key: Tensor) -> tuple[Tensor, Tensor]:
         """Return orientation and cell of the least key [G, 6, W, D], the first of equals.

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -24,6 +25,8 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import UNKNOWN, Bins, check_device
+from marl_pack.checks import shown, whole_number
+from marl_pack.game import invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import GameState, refuse_where
@@ -38,6 +41,8 @@ MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
 LAST_EPISODE = 2**62
 """The largest number of an episode."""
+MOST_SEED = 2**63 - 1
+"""Largest seed of a game; a search plays seeds below 0."""
 
 
 @document(" " * 8)
@@ -56,6 +61,8 @@ class Packing:
         orientation_mask: bool [G, 6], the orientations that may be chosen: those with a legal cell.
         alive: bool [G], false where an episode has ended (only without ``auto_reset``).
         turn: an object that stands for this turn of these games: it changes with the masks.
+        checked: whether every placement is compared with plain code, which is slow
+            (:mod:`marl_pack.game.invariants`).
         orientation_sets: which orientations items may take in this game, with the share of items
             that may take exactly those.
         n, size, volume, floor: G, (W, D, H), W · D · H, and the numbers of cells and pairs.
@@ -96,13 +103,17 @@ class Packing:
         first_episode: int = 0,
         **options: Any,
     ) -> None:
-        if n < 1:
-            raise ValueError(f"n = {n}: needs at least one game")
+        if not isinstance(auto_reset, bool | np.bool_):
+            raise ValueError(f"auto_reset = {shown(auto_reset)}: needs true or false")
+        if not (spec is None or isinstance(spec, GameSpec)):
+            raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
         options |= {} if bin is None else {"bin": bin}
         self.spec = (spec or GameSpec()).with_options(options)
-        self.n, self.auto_reset = n, auto_reset
+        self.n = n = whole_number(n, "n, at least one game", 1)
+        self.auto_reset = bool(auto_reset)
+        self.checked = invariants.wanted()
         self.device = check_device(device)
-        self.backend = backend or default_backend(self.device)
+        self.backend = _backend_of(backend, self.device)
         self.size = self.spec.bin
         width, depth, height = self.size
         self.floor, self.volume = Floor(width, depth), width * depth * height
@@ -112,12 +123,27 @@ class Packing:
         self._games = torch.arange(n, device=self.device)
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
-        self.seed = seed
-        most = self._most_items(self.stream.smallest, self.stream.longest)
-        where = self.device, self.backend
-        self._bins = bin_state.empty(n, self.size, most, *where)
-        self._empty = bin_state.empty(n, self.size, 0, *where)
-        self.reset(seed, first_episode)
+        self._axes = orientation_table(self.device)
+        self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
+        self.seed = whole_number(seed, "seed", 0, MOST_SEED)
+        self.reset(first_episode=first_episode)
+
+    def __copy__(self) -> Packing:
+        """Return games that continue exactly as these do; only the item stream is shared."""
+        return copy.deepcopy(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Packing:
+        """Return games that continue exactly as these do; only the item stream is shared."""
+        memo[id(self.stream)] = self.stream  # pure functions of tables that never change
+        copied = memo[id(self)] = object.__new__(type(self))
+        vars(copied).update(copy.deepcopy(vars(self), memo))
+        return copied
+
+    def _alias(self) -> Packing:
+        """Return games that share everything with these, to replace parts of."""
+        alias = object.__new__(type(self))
+        vars(alias).update(vars(self))
+        return alias
 
     def _most_items(self, smallest: int, longest: int | None) -> int:
         """Return the most boxes that a bin can ever hold.
@@ -156,25 +182,41 @@ class Packing:
         """Where the item may be placed in each orientation, bool [G, 6, W, D]."""
         return self.moves.mask
 
-    def reset(self, seed: int | None = None, first_episode: int = 0) -> None:
+    def reset(
+        self, seed: int | None = None, first_episode: int = 0, *, skip: bool | None = None
+    ) -> None:
         """Empty all bins and begin the episodes ``first_episode + g``.
 
+        Args:
+            seed: of the item streams; the last one by default.
+            first_episode: see above.
+            skip: go on to each game's next episode where the first item has no legal cell; by
+                default only with ``auto_reset``.
+
         Raises:
-            ValueError: with ``auto_reset``, if no episode has a legal first item.
+            ValueError: for an impossible seed or episode, or if all episodes are skipped; nothing
+                has changed then.
         """
+        before = dict(vars(self))
         if seed is not None:
-            self.seed = int(seed)
-        bin_state.clear(self._bins, slice(None))
-        self._start(self._games + first_episode)
-        if self.auto_reset:
-            self._restart(~self.alive)
+            self.seed = whole_number(seed, "seed", 0, MOST_SEED)
+        first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
+        try:
+            self._start(self._games + first)
+            if self.auto_reset if skip is None else skip:
+                self._restart(~self.alive)
+        except ValueError:
+            vars(self).update(before)
+            raise
 
     def _start(self, episode: Tensor) -> None:
-        """Begin episodes, int64 [G], in the empty bins."""
+        """Begin episodes, int64 [G], in empty bins."""
+        most = self._most_items(self.stream.smallest, self.stream.longest)
+        bins = bin_state.empty(self.n, self.size, most, self.device, self.backend)
         t = torch.zeros_like(episode)
         stream = self.stream.start(self.seed, episode)
         lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
-        self.state = GameState(self._bins, self.stream.item(stream, t), episode, t, lost, stream)
+        self.state = GameState(bins, self.stream.item(stream, t), episode, t, lost, stream)
         self._find_moves()
 
     def set_state(self, state: GameState) -> None:
@@ -228,11 +270,8 @@ class Packing:
         Raises:
             ValueError: naming the first game and tensor that are wrong.
         """
-        again, count = copy.copy(self), state.bins.count
+        again, count = self._alias(), state.bins.count
         again.auto_reset = False
-        again._bins = bin_state.empty(
-            self.n, self.size, state.bins.boxes.shape[1], self.device, self.backend
-        )
         beyond = (state.episode < -LAST_EPISODE) | (state.episode > LAST_EPISODE)
         refuse_where(beyond, "episode", "the number of an episode")
         again._start(state.episode.clone())
@@ -274,18 +313,26 @@ class Packing:
         They do not restart when they end.
 
         Args:
-            games: int64 [K], the games to copy; one may come several times.
+            games: int64 [K], the games to copy, each from 0 to G - 1; one may come several times.
             stream: of the items after the visible ones; this game's by default. If its ids have
                 other texts, the boxes that the copies begin with have no ids in :meth:`plans`.
             seed, episodes: int64 [K], the episodes of ``stream`` that come.
+
+        Raises:
+            ValueError: if the numbers of games or episodes are impossible.
         """
-        branched = copy.copy(self)
+        if not isinstance(games, Tensor) or games.dtype != torch.int64 or games.dim() != 1:
+            raise ValueError(f"games: needs int64 [K], numbers of games, not {_described(games)}")
+        if len(games) and not 0 <= int(games.min()) <= int(games.max()) < self.n:
+            raise ValueError(f"games: needs numbers of games from 0 to {self.n - 1}")
+        branched = self._alias()
         branched.n, branched.auto_reset = len(games), False
         branched._games = torch.arange(len(games), device=self.device)
         branched.bin_height = self.bin_height[games]
         branched.state = self.state.select(games)
         if stream is not None:
-            assert episodes is not None, "episodes go with a stream"
+            if episodes is None or episodes.shape != games.shape:
+                raise ValueError(f"episodes: a stream needs one for each of {len(games)} games")
             branched.stream, branched.seed = stream, seed
             branched.orientation_sets = _orientation_sets(stream, self.spec)
             most = self._most_items(min(self.stream.smallest, stream.smallest), None)
@@ -296,7 +343,6 @@ class Packing:
                 branched.state.items = replace(branched.items, ids=ids)
             branched.state.episode = episodes
             branched.state.stream = stream.start(seed, episodes)
-        branched._bins = branched.state.bins
         branched.turn = object()
         branched.moves = Moves(self.mask[games])
         branched.orientation_mask, branched.alive = self.orientation_mask[games], self.alive[games]
@@ -313,19 +359,59 @@ class Packing:
         """Return items in their six orientations; those that may not be chosen get zero sides."""
         return self.legal.orient(items)
 
-    def orient(self, orientation: Tensor) -> Oriented:
+    def orient(self, orientation: Tensor, *, check: bool = True) -> Oriented:
         """Return each item in an orientation, with its legal cells: the first turn.
 
         It changes nothing in the game.
 
         Args:
             orientation: int64 [G], indices into :data:`marl_pack.geometry.ORIENTATIONS`.
+            check: whether to check the range on another device than the CPU, which waits for it.
+                On the CPU the check costs nothing and is always made.
+
+        Raises:
+            ValueError: unless they are indices 0 … 5, one for each game.
         """
+        self._check_choice("orientation", orientation)
+        if check and self.device.type != "cpu":
+            self._check_orientations(orientation)
         return Oriented(self._sides(orientation), self.moves.of(orientation))
 
+    def _check_choice(self, what: str, choice: Tensor) -> None:
+        """Raise ValueError unless a choice is int64 [G] on the games' device."""
+        if (
+            not isinstance(choice, Tensor)
+            or choice.dtype != torch.int64
+            or choice.shape != (self.n,)
+            or choice.device != self._games.device
+        ):
+            raise ValueError(
+                f"{what}: needs one whole number for each of {self.n} games, int64 [{self.n}] on "
+                f"{self._games.device}, not {_described(choice)}"
+            )
+
+    def _check_orientations(self, orientation: Tensor) -> None:
+        """Raise ValueError unless all orientations are indices 0 … 5."""
+        wrong = ((orientation < 0) | (orientation >= len(ALL_ORIENTATIONS))).nonzero()
+        if len(wrong):
+            g = int(wrong[0])
+            raise ValueError(
+                f"game {g}: orientation: needs a whole number from 0 to 5, not "
+                f"{int(orientation[g])}"
+            )
+
     def _sides(self, orientation: Tensor) -> Tensor:
-        """Return the items' sides along x, y, z, int16 [G, 3]."""
-        return self.items.sides.gather(1, orientation_table(self.device)[orientation])
+        """Return the items' sides along x, y, z, int16 [G, 3].
+
+        Raises:
+            ValueError: on the CPU, unless all orientations are indices 0 … 5.
+        """
+        try:  # unlike indexing, gather refuses negative indices
+            axes = self._axes.gather(0, orientation[:, None].expand(-1, 3))
+        except RuntimeError:
+            self._check_orientations(orientation)
+            raise
+        return self.items.sides.gather(1, axes)
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
         """Place each item and bring the next one: the second turn.
@@ -339,20 +425,19 @@ class Packing:
         Raises:
             ValueError: if a choice is not legal; then nothing has changed.
         """
-        state, alive = self.state, self.alive
-        if orientation.shape != (self.n,) or cell.shape != (self.n,):
-            raise ValueError(
-                f"orientation {list(orientation.shape)} and cell {list(cell.shape)}: need one "
-                f"whole number for each of {self.n} games"
-            )
+        self._check_choice("orientation", orientation)
+        self._check_choice("cell", cell)
         if check:
             self._check(orientation, cell)
-        sides = self._sides(orientation)
+        state, alive = self.state, self.alive
+        expected = invariants.before(self, orientation, cell) if self.checked else None
+        sides, played = self._sides(orientation), alive
         if not self.spec.mask_orientations:
             possible = Moves.gather(self.moves.orientations, orientation)
             state.lost = state.lost | (alive & ~possible)
+            played = alive & ~state.lost
         if not (self.auto_reset and self.spec.mask_orientations):
-            sides = torch.where((alive & ~state.lost)[:, None], sides, 0)
+            sides = torch.where(played[:, None], sides, 0)
         com, unit = None, 1.0
         if any(self.spec.com_offset):
             item = self.orient_item(self.items)
@@ -367,13 +452,18 @@ class Packing:
         reward = (self._gain * volume).sub_(waste, alpha=self._loss).float()
         filled, placed = state.bins.filled.clone(), state.bins.count.clone()
 
+        if expected is not None:
+            invariants.check_bins(state.bins, expected)
+
         # A game that has ended keeps the item that had no place, and so its empty mask.
-        state.t = state.t + (alive & ~state.lost)
+        state.t = state.t + played
         state.items = self.stream.item(state.stream, state.t)
         self._find_moves()
         done = alive & ~self.alive
         if self.auto_reset:
             self._restart(done)
+        if self.checked:
+            invariants.check(self)
         return Outcome(reward, done, filled, placed, self.volume)
 
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
@@ -418,9 +508,9 @@ class Packing:
             ended = ended & ~self.alive
         first = self.items.sides[int(ended.nonzero()[0])].tolist()
         raise ValueError(
-            f"no item that begins an episode, such as {first}, may be placed anywhere in the empty "
-            f"bin {self.size}: check the orientations allowed {self.spec.orientations}, the rule's "
-            "margin and com_offset"
+            f"no item that begins an episode has a place: one such as {first} may be placed nowhere "
+            f"in the empty bin {self.size}: check the orientations allowed "
+            f"{self.spec.orientations}, the rule's margin and com_offset"
         )
 
     def _begin_some(self, ended: Tensor) -> None:
@@ -460,3 +550,21 @@ def _orientation_sets(stream: Stream, spec: GameSpec) -> dict[tuple[int, ...], f
         allowed = tuple(o for o in orientations if o in spec.orientations)
         shares[allowed] = shares.get(allowed, 0.0) + share
     return shares
+
+
+def _backend_of(backend: Backend | None, device: torch.device) -> Backend:
+    """Return the backend, the device's default if None; refuse one that cannot work there."""
+    if backend is None:
+        return default_backend(device)
+    if not isinstance(backend, Backend):
+        raise ValueError(f"backend = {shown(backend)}: needs one of {', '.join(map(str, Backend))}")
+    if backend is Backend.COMPILED and device.type != "cpu":
+        raise ValueError(f"backend = {backend}: needs the device cpu, not {device}")
+    return backend
+
+
+def _described(value: object) -> str:
+    """Return the type, shape and device of a value for a message."""
+    if not isinstance(value, Tensor):
+        return f"a {type(value).__name__}"
+    return f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)} on {value.device}"

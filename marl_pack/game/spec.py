@@ -10,17 +10,17 @@ from __future__ import annotations
 import argparse
 import difflib
 import inspect
-import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from numbers import Integral, Real
+from numbers import Integral
 from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
 
 from marl_pack import renamed
+from marl_pack.checks import real_number, shown
 from marl_pack.geometry import check_size
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import RULES, Rule, make_rule
@@ -55,7 +55,11 @@ def _option(
 def _rule(value: Any) -> Any:
     if callable(value) or (isinstance(value, str) and value in RULES):
         return value
-    raise ValueError(f"unknown stability rule {value!r}: one of {', '.join(RULES)}")
+    raise ValueError(f"unknown stability rule {shown(value)}: one of {', '.join(RULES)}")
+
+
+MOST_ITEMS = 2**31 - 1
+"""Largest number of items that a bin may be limited to."""
 
 
 def _is_whole(value: Any) -> bool:
@@ -63,9 +67,10 @@ def _is_whole(value: Any) -> bool:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-        raise ValueError(f"{value!r}: needs a finite number")
-    return float(value)
+    try:
+        return real_number(value, "")
+    except ValueError:
+        raise ValueError(f"{shown(value)}: needs a finite number") from None
 
 
 def _margin(value: Any) -> float | None:
@@ -74,28 +79,43 @@ def _margin(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
+def _listed(value: Any) -> list[Any]:
+    """Return the values in a list, tuple, set or array; none for texts, bytes and mappings."""
+    no_list = str | bytes | bytearray | Mapping
+    return list(value) if isinstance(value, Iterable) and not isinstance(value, no_list) else []
+
+
+def _com_offset(value: Any) -> tuple[float, float, float]:
+    numbers = _listed(value)
+    if len(numbers) != 3:
+        raise ValueError(f"{shown(value)}: needs three fractions of the item's own sides w, d, h")
+    return check_com_offset(tuple(map(_number, numbers)))
+
+
 def _thresholds(value: Any) -> str | None:
-    if value is not None and value not in THRESHOLDS:
-        raise ValueError(f"{value!r}: one of {', '.join(THRESHOLDS)}")
+    if value is not None and not (isinstance(value, str) and value in THRESHOLDS):
+        raise ValueError(f"{shown(value)}: one of {', '.join(THRESHOLDS)}")
     return None if value is None else str(value)
 
 
 def _orientations(value: Any) -> tuple[int, ...]:
-    chosen = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    chosen = _listed(value)
     if not chosen or not all(map(_is_whole, chosen)) or not set(chosen) <= set(ALL_ORIENTATIONS):
-        raise ValueError(f"{value!r}: need one or more of 0 … 5")
+        raise ValueError(f"{shown(value)}: need one or more of 0 … 5")
     return tuple(sorted({int(o) for o in chosen}))
 
 
 def _switch(value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{value!r}: needs true or false")
+        raise ValueError(f"{shown(value)}: needs true or false")
     return bool(value)
 
 
 def _max_items(value: Any) -> int | None:
-    if value is not None and not (_is_whole(value) and value >= 1):
-        raise ValueError(f"{value!r}: needs a whole number ≥ 1, or none for no limit")
+    if value is not None and not (_is_whole(value) and 1 <= value <= MOST_ITEMS):
+        raise ValueError(
+            f"{shown(value)}: needs a whole number ≥ 1 and ≤ {MOST_ITEMS}, or none for no limit"
+        )
     return None if value is None else int(value)
 
 
@@ -154,7 +174,7 @@ class GameSpec:
     )  # fmt: skip
     com_offset: tuple[float, float, float] = _option(
         NO_OFFSET, "centre of mass of the items from their middle, in fractions of w, d, h.",
-        check_com_offset,
+        _com_offset,
         lambda offset: f"centre of mass off by {' '.join(f'{o:g}' for o in offset)}",
         nargs=3, type=float, metavar=("X", "Y", "Z"),
     )  # fmt: skip

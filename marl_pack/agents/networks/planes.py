@@ -49,7 +49,7 @@ class Sight:
         """Sides of the item int16 [G, 3]: its own, or along x, y, z in the chosen orientation."""
         if self.orientation is None:
             return self.game.items.sides
-        return self.game.orient(self.orientation).sides
+        return self.game.orient(self.orientation, check=False).sides
 
     def judged(self, values: Tensor) -> Tensor:
         """Select the values [G, 6, …] of the A orientations that the agent judges, [G, A, …]."""
