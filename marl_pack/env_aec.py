@@ -121,6 +121,9 @@ class Copied:
 class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
     """PettingZoo's outermost wrapper: it names calls in a wrong order, and wrong actions."""
 
+    _has_reset: bool
+    _has_updated: bool
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begin an episode; a refused one changes nothing."""
         before = self._has_reset, self._has_updated
@@ -315,8 +318,9 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
                 raise ValueError(f'options["items"]: {error}') from None
             if not bool(game.alive):
                 raise ValueError(
-                    f'options["items"]: the first item {game.items.sides[0].tolist()} may be placed '
-                    "nowhere in the empty bin: check orientations, the rule's margin and com_offset"
+                    f'options["items"]: the first item {game.items.sides[0].tolist()} may be '
+                    "placed nowhere in the empty bin: check orientations, the rule's margin and "
+                    "com_offset"
                 )
         else:
             game = self._stream_game

@@ -69,6 +69,12 @@ def test_progress_counts_every_episode_once() -> None:
     assert sum(counted) == 30
 
 
+@pytest.mark.parametrize("episodes", [0, -1, 1.5, True, "3"])
+def test_episodes_to_play_are_a_whole_number(episodes: object) -> None:
+    with pytest.raises(ValueError, match="episodes: needs a whole number >= 1"):
+        rollout.play(make_policy("dblf"), lambda n, first: Packing(n), episodes)
+
+
 def filled(height: int, boxes: int) -> Plan:
     """A bin of 10³ with so many plates, filled up to a height."""
     rows = [(0, 0, k, 10, 10, 1) for k in range(boxes - 1)]

@@ -59,7 +59,7 @@ def test_a_rule_of_the_user_is_checked_for_what_fits() -> None:
     def anywhere(bins: Any, item: Any) -> torch.Tensor:
         return torch.ones_like(flat(bins, item))
 
-    with pytest.raises(AssertionError, match="mask at .* is True, but must be False"):
+    with pytest.raises(AssertionError, match=r"mask at .* is True, but must be False"):
         in_play(2, 1, bin=(4, 4, 5), sides=(1, 3), rule=anywhere)
 
 

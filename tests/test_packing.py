@@ -14,7 +14,6 @@ from marl_pack.items import check_items
 from marl_pack.stability import RULES, make_rule
 
 NUMBER = "needs a whole number"
-HIDDEN = np.ma.array([[2, 2, 2], [9, 9, 9]], mask=[[0] * 3, [1] * 3])
 
 
 def test_a_game_worked_by_hand() -> None:
@@ -267,10 +266,6 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"auto_reset": "no"}, "auto_reset = 'no': needs true or false"),
         ({"spec": {}}, "spec = {}: needs a GameSpec"),
         ({"backend": "tensor"}, "backend = 'tensor': needs one of Backend.COMPILED, "),
-        ({"items": HIDDEN}, "items: items: some values are masked"),
-        ({"items": [HIDDEN, [[2, 2, 2]]]}, "items: items: some values are masked"),
-        ({"items": {"items": [[2, 2, 2]], "weights": np.ma.array([1.0], mask=[1])}},
-         "items: weights: some values are masked"),
     ],
 )  # fmt: skip
 def test_impossible_games_are_refused(arguments: dict[str, object], why: str) -> None:
@@ -299,7 +294,9 @@ def test_choices_are_whole_numbers_one_for_each_game(choice: object, backend: Ba
         lambda: game.place(zeros, choice),
         lambda: game.place(zeros, choice, check=False),
     ):
-        with pytest.raises(ValueError, match=r": needs one whole number for each of 3 games, int64"):
+        with pytest.raises(
+            ValueError, match=r": needs one whole number for each of 3 games, int64"
+        ):
             play()
     assert all(torch.equal(value, before[name]) for name, value in game.state_dict().items())
 

@@ -1,9 +1,9 @@
 """Compare games with plain code around every placement: the mode ``MARL_PACK_CHECK=1``.
 
-The truth is the table of boxes. From it alone the maps, the counts and the masks are computed again,
-one box and one window at a time, by :mod:`marl_pack.stability.reference` and, for the rule
-``equilibrium``, by the linear program of the whole stack. This is slow: it is for tests, and for the
-search for a fault.
+The truth is the table of boxes. From it alone the maps, the counts and the masks are computed
+again, one box and one window at a time, by :mod:`marl_pack.stability.reference` and, for the rule
+``equilibrium``, by the linear program of the whole stack. This is slow: it is for tests, and for
+the search for a fault.
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def _verdict(
 ) -> Callable[[Any, int, int], bool]:
     """Return the definition of a rule: (window, x, y) → whether the item stands there."""
     (heights, empty), boxes = maps, table[:, :6].astype(np.int64)
-    centre, margin = item[3:5], parameters.get("margin", 0.0)
+    centre, margin = (item[3], item[4]), parameters.get("margin", 0.0)
     if rule == "none":
         return lambda window, x, y: True
     if rule == "area_ratio":

@@ -20,7 +20,7 @@ from torch import Tensor
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
 from marl_pack.game.spec import GameSpec
-from marl_pack.geometry import ORIENTATIONS
+from marl_pack.geometry import ORIENTATIONS, orientation_table
 from marl_pack.items import Items
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import OrientedItem, orient_item
@@ -219,3 +219,36 @@ def _corners_compiled(cells: Tensor, depth: int) -> Tensor:
 
 def _corners_tensor(cells: Tensor, depth: int) -> Tensor:
     return torch.stack((cells // depth, cells % depth), 1)
+
+
+TABLE = np.array(ORIENTATIONS)
+
+
+@njit(cache=True)
+def _write_sides(sides: Any, orientation: Any, table: Any, chosen: Any) -> bool:
+    """Write the sides along x, y, z; return whether all orientations are rows of the table."""
+    for g in range(orientation.size):
+        o = orientation[g]
+        if not 0 <= o < len(table):
+            return False
+        for axis in range(3):
+            chosen[g, axis] = sides[g, table[o, axis]]
+    return True
+
+
+def sides_compiled(sides: Tensor, orientation: Tensor) -> Tensor:
+    """Return items' sides [G, 3] along x, y, z in orientations int64 [G], by a compiled loop.
+
+    Raises:
+        IndexError: for an orientation that is none of 0 … 5.
+    """
+    chosen = np.empty((len(sides), 3), np.int16)
+    if not _write_sides(sides.numpy(), orientation.numpy(), TABLE, chosen):
+        raise IndexError
+    return torch.from_numpy(chosen)
+
+
+def sides_tensor(sides: Tensor, orientation: Tensor) -> Tensor:
+    """Return what :func:`sides_compiled` does, in tensor code; a GPU does not name the error."""
+    axes = orientation_table(sides.device).index_select(0, orientation)  # refuses negative indices
+    return sides.gather(1, axes)

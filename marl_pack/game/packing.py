@@ -27,11 +27,10 @@ from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import UNKNOWN, Bins, check_device
 from marl_pack.checks import shown, whole_number
 from marl_pack.game import invariants
-from marl_pack.game.moves import Floor, LegalMoves, Moves
+from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides_tensor
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
-from marl_pack.geometry import orientation_table
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.plan import Plan
@@ -123,7 +122,6 @@ class Packing:
         self._games = torch.arange(n, device=self.device)
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
-        self._axes = orientation_table(self.device)
         self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
         self.seed = whole_number(seed, "seed", 0, MOST_SEED)
         self.reset(first_episode=first_episode)
@@ -198,26 +196,32 @@ class Packing:
                 has changed then.
         """
         before = dict(vars(self))
-        if seed is not None:
-            self.seed = whole_number(seed, "seed", 0, MOST_SEED)
-        first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
+        most = self._most_items(self.stream.smallest, self.stream.longest)
         try:
-            self._start(self._games + first)
+            if seed is not None:
+                self.seed = whole_number(seed, "seed", 0, MOST_SEED)
+            first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
+            self._start(self._games + first, most)
             if self.auto_reset if skip is None else skip:
                 self._restart(~self.alive)
         except ValueError:
             vars(self).update(before)
             raise
 
-    def _start(self, episode: Tensor) -> None:
-        """Begin episodes, int64 [G], in empty bins."""
-        most = self._most_items(self.stream.smallest, self.stream.longest)
+    def _start(self, episode: Tensor, most: int) -> None:
+        """Begin episodes, int64 [G], in new bins that can hold ``most`` boxes."""
         bins = bin_state.empty(self.n, self.size, most, self.device, self.backend)
         t = torch.zeros_like(episode)
         stream = self.stream.start(self.seed, episode)
         lost = torch.zeros(self.n, dtype=torch.bool, device=self.device)
         self.state = GameState(bins, self.stream.item(stream, t), episode, t, lost, stream)
         self._find_moves()
+
+    def _alias(self) -> Packing:
+        """Return games that share everything with these, to be given a state of their own."""
+        alias = object.__new__(type(self))
+        vars(alias).update(vars(self))
+        return alias
 
     def set_state(self, state: GameState) -> None:
         """Put the games into a copy of a state, such as one of :meth:`GameState.select`.
@@ -274,7 +278,7 @@ class Packing:
         again.auto_reset = False
         beyond = (state.episode < -LAST_EPISODE) | (state.episode > LAST_EPISODE)
         refuse_where(beyond, "episode", "the number of an episode")
-        again._start(state.episode.clone())
+        again._start(state.episode.clone(), state.bins.boxes.shape[1])
         refuse_where(again.state.stream != state.stream, "stream", "the items of its episode")
         for k in range(int(count.max())):
             again.alive = again.alive & (k < count)
@@ -406,12 +410,13 @@ class Packing:
         Raises:
             ValueError: on the CPU, unless all orientations are indices 0 … 5.
         """
-        try:  # unlike indexing, gather refuses negative indices
-            axes = self._axes.gather(0, orientation[:, None].expand(-1, 3))
-        except RuntimeError:
+        sides = self.items.sides
+        code = self.backend.pick(compiled=sides_compiled, tensor=sides_tensor)
+        try:
+            return code(sides, orientation)
+        except IndexError:
             self._check_orientations(orientation)
             raise
-        return self.items.sides.gather(1, axes)
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
         """Place each item and bring the next one: the second turn.
@@ -508,8 +513,8 @@ class Packing:
             ended = ended & ~self.alive
         first = self.items.sides[int(ended.nonzero()[0])].tolist()
         raise ValueError(
-            f"no item that begins an episode has a place: one such as {first} may be placed nowhere "
-            f"in the empty bin {self.size}: check the orientations allowed "
+            f"no item that begins an episode has a place: one such as {first} may be placed "
+            f"nowhere in the empty bin {self.size}: check the orientations allowed "
             f"{self.spec.orientations}, the rule's margin and com_offset"
         )
 

@@ -81,7 +81,7 @@ def _margin(value: Any) -> float | None:
 
 def _listed(value: Any) -> list[Any]:
     """Return the values in a list, tuple, set or array; none for texts, bytes and mappings."""
-    no_list = str | bytes | bytearray | Mapping
+    no_list = (str, bytes, bytearray, Mapping)
     return list(value) if isinstance(value, Iterable) and not isinstance(value, no_list) else []
 
 
