@@ -9,9 +9,15 @@ from conftest import in_play
 
 from marl_pack import bins as bin_state
 from marl_pack import env_aec
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.networks.actor_critic import make_actor
+from marl_pack.agents.search import Planner, SearchSettings
 from marl_pack.backend import Backend
+from marl_pack.game import invariants
 from marl_pack.game.packing import Packing
+from marl_pack.items import make_stream
 from marl_pack.stability import RULES
 
 UPRIGHT = {
@@ -71,6 +77,23 @@ def test_the_environment_is_checked_too() -> None:
     env.unwrapped._game.bins.empty_map[0, 3, 3] = 2
     with pytest.raises(AssertionError, match=r"game 0: empty_map at \(x, y\) = \(3, 3\) is 2"):
         env.step(0)
+
+
+@pytest.mark.usefixtures("checked")
+def test_the_games_that_a_search_imagines_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    network, lookahead = {"channels": 8, "layers": 2}, Lookahead()
+    agents = (
+        LearnedAgent(kind, make_actor(kind, network, "cpu").eval(), lookahead)
+        for kind in ("orientation", "placement")
+    )
+    futures = make_stream("rs", (4, 4, 5), (1, 3))
+    planner = Planner(*agents, None, SearchSettings(rollouts=1, top=2), futures)
+    game, compared = Packing(2, (4, 4, 5), sides=(1, 3)), []
+    check = invariants.check
+    monkeypatch.setattr(invariants, "check", lambda games: [compared.append(games), check(games)])
+    game.place(*planner(game))
+    assert len(set(map(id, compared))) > 2
 
 
 def raise_box(game: Packing) -> None:

@@ -327,7 +327,8 @@ class Packing:
         """
         if not isinstance(games, Tensor) or games.dtype != torch.int64 or games.dim() != 1:
             raise ValueError(f"games: needs int64 [K], numbers of games, not {_described(games)}")
-        if len(games) and not 0 <= int(games.min()) <= int(games.max()) < self.n:
+        known = self.device.type == "cpu" and len(games) > 0  # another device would be waited for
+        if known and not 0 <= int(games.min()) <= int(games.max()) < self.n:
             raise ValueError(f"games: needs numbers of games from 0 to {self.n - 1}")
         branched = self._alias()
         branched.n, branched.auto_reset = len(games), False
@@ -335,9 +336,10 @@ class Packing:
         branched.bin_height = self.bin_height[games]
         branched.state = self.state.select(games)
         if stream is not None:
-            if episodes is None or episodes.shape != games.shape:
+            if not isinstance(episodes, Tensor) or episodes.shape != games.shape:
                 raise ValueError(f"episodes: a stream needs one for each of {len(games)} games")
-            branched.stream, branched.seed = stream, seed
+            branched.stream = stream
+            branched.seed = whole_number(seed, "seed", -1 - MOST_SEED, MOST_SEED)
             branched.orientation_sets = _orientation_sets(stream, self.spec)
             most = self._most_items(min(self.stream.smallest, stream.smallest), None)
             branched.state.bins = branched.bins.for_boxes(most)
@@ -345,7 +347,7 @@ class Packing:
                 branched.bins.labels[..., 0] = UNKNOWN
                 ids = torch.full_like(branched.t, UNKNOWN)
                 branched.state.items = replace(branched.items, ids=ids)
-            branched.state.episode = episodes
+            branched.state.episode = episodes.clone()
             branched.state.stream = stream.start(seed, episodes)
         branched.turn = object()
         branched.moves = Moves(self.mask[games])
