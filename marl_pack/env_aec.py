@@ -124,6 +124,10 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
     _has_reset: bool
     _has_updated: bool
 
+    def __init__(self, env: AECEnv) -> None:
+        super().__init__(env)
+        self._raw = env.unwrapped  # the wrappers' own look-ups take microseconds
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begin an episode; a refused one changes nothing."""
         before = self._has_reset, self._has_updated
@@ -139,8 +143,8 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
         Raises:
             ValueError: for an action that is no whole number of its action space.
         """
-        if self._has_reset and self.agents and action is not None:
-            action = self.unwrapped.check_action(self.agent_selection, action)
+        if action is not None and self._has_reset and self._raw.agents:
+            action = self._raw.check_action(self._raw.agent_selection, action)
         super().step(action)
 
     def last(self, observe: bool = True) -> Any:
@@ -253,6 +257,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: width * depth}
         if pad_actions:
             choices = dict.fromkeys(AGENTS, max(choices.values()))
+        self._choices = choices
         planes = spaces.Box(0.0, 1.0, (5 if pad_actions else 4, width, depth), np.float32)
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
@@ -400,9 +405,12 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         Raises:
             ValueError: unless it is a whole number of the agent's action space.
         """
+        last = self._choices[agent] - 1
+        if type(action) is int and 0 <= action <= last:  # the usual case
+            return action
         if type(action) in (np.ndarray, torch.Tensor) and action.ndim == 0:
             action = action.item()
-        return whole_number(action, f"{agent}: action", 0, int(self.action_spaces[agent].n) - 1)
+        return whole_number(action, f"{agent}: action", 0, last)
 
     def _legal(self, agent: str, action: Any) -> tuple[int, bool]:
         """Return the action to play, and whether it had to be repaired."""
