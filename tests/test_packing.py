@@ -263,6 +263,8 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
           for value in ("000", None, ("0.1", 0, 0), (True, 0, 0), (0.1, 0))],
         *[({name: 10**400}, f"{name} = .*: needs a finite number") for name in ("alpha", "margin")],
         ({"thresholds": ["code"]}, "thresholds = .*: one of paper, code"),
+        ({"items": [np.ma.array([[2, 2, 2], [9, 9, 9]], mask=[[0] * 3, [1] * 3])]},
+         "items: has masked values"),
         ({"auto_reset": "no"}, "auto_reset = 'no': needs true or false"),
         ({"spec": {}}, "spec = {}: needs a GameSpec"),
         ({"backend": "tensor"}, "backend = 'tensor': needs one of Backend.COMPILED, "),

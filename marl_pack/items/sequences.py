@@ -218,6 +218,9 @@ def split_sequences(items: Any, source: str) -> tuple[Sequence[Any] | NDArray[An
         raise ValueError(f"{source}: needs a list of rows [w, d, h], or of such lists")
     first = items[0]
     single = not (_is_list(first) and len(first) and _is_list(first[0]))
+    for part in items:
+        if isinstance(part, np.ma.MaskedArray):
+            _array(part, source)
     return [items] if single else list(items), single
 
 
