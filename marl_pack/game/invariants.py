@@ -22,8 +22,11 @@ from marl_pack.game.moves import LegalMoves, Moves
 from marl_pack.game.spec import GameSpec
 from marl_pack.game.state import GameState
 from marl_pack.geometry import ORIENTATIONS, Size
-from marl_pack.stability import RULES, in_equilibrium, reference
-from marl_pack.stability.equilibrium_masks import DIRECTIONS
+from marl_pack.stability import RULES, reference
+from marl_pack.stability.centres import exact
+from marl_pack.stability.equilibrium_masks import shifts_of
+from marl_pack.stability.exact_equilibrium import Load
+from marl_pack.stability.static_equilibrium import stands as stack_stands
 from marl_pack.stability.support_area import check_thresholds
 
 VARIABLE = "MARL_PACK_CHECK"
@@ -72,7 +75,9 @@ def before(game: Games, orientation: Tensor, cell: Tensor) -> list[Table]:
     check(game)
     bins, items = game.state.bins.to("cpu"), game.state.items
     item, ids = game.legal.orient(items), _array(items.ids_at(game.state.t))
-    centres, weights = _array(item.centres()), _array(item.weights())
+    table_of_centres = item.centre_table(0.0, max(bins.size[:2]))
+    centres, unit = _array(table_of_centres.units(item.sides)), table_of_centres.unit
+    weights = _array(item.weights())
     tables = []
     for g in range(len(game.state)):
         table = _table(bins, g)
@@ -81,7 +86,8 @@ def before(game: Games, orientation: Tensor, cell: Tensor) -> list[Table]:
             x, y = divmod(number, bins.size[1])
             w, d, h = (int(items.sides[g, axis]) for axis in ORIENTATIONS[o])
             z = int(bins.heightmap[g, x : x + w, y : y + d].max())
-            load = weights[g], x + centres[g, o, 0], y + centres[g, o, 1]
+            centre = (np.array((x, y)) * unit + centres[g, o]) / unit
+            load = weights[g], *centre
             table = np.vstack((table, (x, y, z, w, d, h, *load, ids[g], o)))
         tables.append(table)
     return tables
@@ -120,7 +126,7 @@ def check(game: Games) -> None:
     """
     bins, items, spec = game.state.bins.to("cpu"), game.state.items.to("cpu"), game.spec
     item = game.legal.orient(game.state.items)
-    centres, weights = _array(item.centres()), _array(item.weights())
+    weights = _array(item.weights())
     rule: Any = game.legal.rule
     function, parameters = getattr(rule, "func", rule), getattr(rule, "keywords", {})
     known = function in RULES.values()
@@ -137,9 +143,9 @@ def check(game: Games) -> None:
             _mask(
                 function.__name__ if known else "none", tuple(parameters.items()) if known else (),
                 bins.size, tuple(map(tuple, table[:, :9].tolist())),
-                (*side.tolist(), *centre.tolist(), float(weights[g])),
+                (*side.tolist(), *item.exact_centre(o, *side[:2].tolist()), float(weights[g])),
             )
-            for side, centre in zip(sides, centres[g], strict=True)
+            for o, side in enumerate(sides)
         ])  # fmt: skip
         mask &= not closed
         actual = _array(game.moves.mask[g])
@@ -219,7 +225,7 @@ def _mask(
     parameters: tuple[tuple[str, Any], ...],
     size: Size,
     rows: tuple[tuple[float, ...], ...],
-    item: tuple[float, ...],
+    item: tuple[Any, ...],
 ) -> Mask:
     """Return the mask of an item in one orientation by the definition of a rule, bool [W, D].
 
@@ -246,7 +252,7 @@ def _verdict(
     parameters: dict[str, Any],
     table: Table,
     maps: tuple[Map, Map],
-    item: tuple[float, ...],
+    item: tuple[Any, ...],
 ) -> Callable[[Any, int, int], bool]:
     """Return the definition of a rule: (window, x, y) → whether the item stands there."""
     (heights, empty), boxes = maps, table[:, :6].astype(np.int64)
@@ -264,14 +270,13 @@ def _verdict(
     def supported(window: Any, x: int, y: int) -> bool:
         return reference.hull(heights[window], bearing[window], centre, margin)
 
+    loads = [Load(*map(exact, row)) for row in table[:, 6:9].tolist()]
+
     def stands(window: Any, x: int, y: int) -> bool:
         z = int(heights[window].max())
         stack = np.vstack((boxes, (x, y, z, *item[:3]))).astype(np.int64)
-        for shift in _shifts(margin):
-            load = item[5], x + centre[0] + shift[0], y + centre[1] + shift[1]
-            if not in_equilibrium(stack, np.vstack((table[:, 6:9], load))):
-                return False
-        return True
+        places = ((x + centre[0] + dx, y + centre[1] + dy) for dx, dy in shifts_of(margin))
+        return all(stack_stands(stack, [*loads, Load(exact(item[5]), *place)]) for place in places)
 
     if rule == "equilibrium":
         if not margin:
@@ -279,11 +284,3 @@ def _verdict(
         # The disc of radius margin is rounded up to a polygon, but not above filled columns.
         return lambda window, x, y: supported(window, x, y) or stands(window, x, y)
     return supported
-
-
-def _shifts(margin: float) -> NDArray[np.float64]:
-    """Return the places of a centre of mass that a margin allows, from its own place, [S, 2]."""
-    if not margin:
-        return np.zeros((1, 2))
-    angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    return margin / np.cos(np.pi / DIRECTIONS) * np.stack((np.cos(angle), np.sin(angle)), 1)

@@ -137,12 +137,6 @@ class Packing:
         vars(copied).update(copy.deepcopy(vars(self), memo))
         return copied
 
-    def _alias(self) -> Packing:
-        """Return games that share everything with these, to replace parts of."""
-        alias = object.__new__(type(self))
-        vars(alias).update(vars(self))
-        return alias
-
     def _most_items(self, smallest: int, longest: int | None) -> int:
         """Return the most boxes that a bin can ever hold.
 

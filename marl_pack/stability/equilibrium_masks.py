@@ -116,7 +116,7 @@ def equilibrium_mask(
     band = possibly & ~sure
     if not bool(band.any()):
         return sure
-    exact_shifts = _shifts(margin)
+    exact_shifts = shifts_of(margin)
     shifts = np.array(exact_shifts, np.float64)
     verdict = np.zeros(tuple(band.shape), np.uint8)
     centres = item.centre_table(0.0, max(bins.size[:2]))
@@ -131,7 +131,7 @@ def equilibrium_mask(
     return sure | torch.from_numpy(verdict == YES).to(device)
 
 
-def _shifts(margin: float) -> list[tuple[Fraction, Fraction]]:
+def shifts_of(margin: float) -> list[tuple[Fraction, Fraction]]:
     """Return the shifts of a centre of mass that it must bear, exact numbers of cells."""
     if margin == 0:
         return [(Fraction(0), Fraction(0))]

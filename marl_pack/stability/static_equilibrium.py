@@ -13,6 +13,8 @@ arithmetic, and is the reference for :mod:`marl_pack.stability.equilibrium_masks
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
@@ -125,11 +127,16 @@ def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
     if not len(stack):
         return True
     load = uniform_loads(stack) if loads is None else _check_loads(loads, len(stack))
-    if least_force(stack, load) > NEAR:
+    return stands(stack, [Load(*map(exact, row)) for row in load.tolist()])
+
+
+def stands(boxes: NDArray[np.int64], loads: Sequence[Load]) -> bool:
+    """Return whether boxes [n ≥ 1, 6] with exact loads are in strict static equilibrium."""
+    rounded = np.array([(float(load.weight), float(load.x), float(load.y)) for load in loads])
+    if least_force(boxes, rounded) > NEAR:
         return True
-    exact_loads = [Load(*map(exact, row)) for row in load.tolist()]
-    pairs, rectangles = contacts(stack)
-    for members in _components(len(stack), pairs):
+    pairs, rectangles = contacts(boxes)
+    for members in _components(len(boxes), pairs):
         number = {box: index for index, box in enumerate(members)} | {GROUND: GROUND}
         forces = [
             Force(x, y, number[upper], number[lower])
@@ -139,7 +146,7 @@ def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
             if upper in number
             for x, y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1))
         ]
-        if not stands_exactly([exact_loads[box] for box in members], forces):
+        if not stands_exactly([loads[box] for box in members], forces):
             return False
     return True
 
