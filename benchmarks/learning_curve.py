@@ -15,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 
 from benchmarks.timing import show
+from marl_pack.files import moved_into_place
 
 LEVELS = (
     ("Zhou et al. 2024", 61.2),
@@ -56,7 +57,8 @@ def draw(runs: list[Path], path: Path, levels: Sequence[tuple[str, float]]) -> N
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("utilization, %")
     panels[0].legend(loc="lower right", bbox_to_anchor=(1, 0.1))
-    figure.savefig(path, dpi=120)
+    with moved_into_place(path) as part:
+        figure.savefig(part, dpi=120)
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from marl_pack.agents.heuristics import POLICIES
 from marl_pack.agents.loading import Loader
 from marl_pack.evaluation.rollout import play
 from marl_pack.evaluation.statistics import interval
+from marl_pack.files import moved_into_place
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import Size
 from marl_pack.items import Stream, choose_stream
@@ -103,7 +104,8 @@ def main() -> None:
     panel.set_ylabel("utilization, %")
     panel.grid(alpha=0.3)
     panel.legend(loc="lower left")
-    figure.savefig(chosen.picture, dpi=120)
+    with moved_into_place(chosen.picture) as part:
+        figure.savefig(part, dpi=120)
     show(
         f"{stream.episodes} sequences",
         ["policy", "rank correlation", "points per 10 cells", "first eighth", "last eighth"],

@@ -1,33 +1,130 @@
-"""Write files so that they are complete or do not exist."""
+"""Write files so that they are complete or do not exist.
+
+A file is written beside its place under a name that nobody else has, and moved into place once it
+is whole. Links are followed. A device, a pipe or the program's own output is written through.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import secrets
+import shutil
+import stat
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+PART = ".part-"  # what the names of unfinished files begin with
+WRITING = 0.05  # share of the time in which a growing file is written, at most
+
+
+def _status(path: Path) -> os.stat_result | None:
+    """Return the status of the file that a path leads to; None if there is none yet."""
+    try:
+        return path.stat()
+    except FileNotFoundError:
+        return None
+
+
+def _stream(status: os.stat_result) -> int | None:
+    """Return the descriptor of the program's own output that a file is, if it is one."""
+    for descriptor in (1, 2):
+        with suppress(OSError):  # it may be closed
+            if os.path.samestat(os.fstat(descriptor), status):
+                return descriptor
+    return None
+
+
+def _written_through(status: os.stat_result | None) -> bool:
+    """Return whether a file is no plain file that could be replaced."""
+    return status is not None and not (stat.S_ISREG(status.st_mode) and _stream(status) is None)
 
 
 def check_writable(path: Path) -> None:
     """Raise ValueError if no file can be written at ``path``."""
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    if not os.access(path.parent, os.W_OK):
-        raise ValueError(f"{path}: the folder {path.parent} may not be written to")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; needs the name of a file")
+    try:
+        status = _status(path)
+    except OSError as error:  # such as a link to itself
+        raise ValueError(f"{path}: {error.strerror}") from None
+    if status is not None and not os.access(path, os.W_OK):
+        raise ValueError(f"{path}: may not be written to")
+    if _written_through(status):
+        return
+    folder = Path(os.path.realpath(path)).parent
+    if not folder.is_dir():
+        raise ValueError(f"{path}: the folder {folder} does not exist")
+    if not os.access(folder, os.W_OK):
+        raise ValueError(f"{path}: the folder {folder} may not be written to")
 
 
 @contextmanager
 def moved_into_place(path: Path) -> Iterator[Path]:
-    """Yield a temporary path with the same ending; move its file into place at the end."""
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    """Yield an empty temporary file with the same ending; move it into place at the end.
+
+    An existing file keeps its mode and owner. What is no plain file receives the content instead.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written; a file that was there stays.
+    """
+    try:
+        status = _status(path)
+        if _written_through(status):
+            with tempfile.TemporaryDirectory() as folder:
+                part = Path(folder, f"part{path.suffix}")
+                yield part
+                _write_through(path, part)
+        else:
+            with _replacing(Path(os.path.realpath(path)), status) as part:
+                yield part
+    except OSError as error:
+        if error.errno is None:  # a library's own, which may show a whole log
+            raise OSError(f"{path}: {str(error).splitlines()[0]}") from None
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+@contextmanager
+def _replacing(target: Path, status: os.stat_result | None) -> Iterator[Path]:
+    """Yield a temporary file in the folder of a plain file, and replace that at the end."""
+    part = target.with_name(f"{PART}{secrets.token_hex(8)}{target.suffix}")
+    mode = 0o666 if status is None else 0o600  # less what the umask takes away
+    os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
     try:
         yield part
-        part.replace(path)
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
+        if status is not None:
+            with suppress(PermissionError):  # another's file in a shared folder
+                shutil.chown(part, status.st_uid, status.st_gid)
+            part.chmod(stat.S_IMODE(status.st_mode))
+        part.replace(target)
     finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_through(path: Path, part: Path) -> None:
+    """Copy a finished file into a device, a pipe or the program's own output."""
+    descriptor = _stream(path.stat())
+    for output in (sys.stdout, sys.stderr):
+        output.flush()
+    with part.open("rb") as file, open(
+        path if descriptor is None else os.dup(descriptor), "wb"
+    ) as out:  # fmt: skip
+        shutil.copyfileobj(file, out)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed programs have left unfinished; the caller knows that none writes there."""
+    for part in folder.glob(f"{PART}*"):
         part.unlink(missing_ok=True)
 
 
@@ -36,15 +133,44 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
 
     Args:
         path: of the file.
-        write: is called with the open binary file.
+        write: is called with a binary file in memory, so that its errors are not the disk's.
     """
+    content = io.BytesIO()
+    write(content)
     with moved_into_place(path) as part, part.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
+        file.write(content.getbuffer())
 
 
 def write_json(path: Path, report: Any) -> None:
     """Write figures as JSON: unknown types as text, NaN refused with ValueError."""
     text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
+
+
+class Growing(Generic[T]):
+    """A file that is written again as its content grows, so that a stopped program leaves it.
+
+    Args:
+        path: of the file; None writes nothing. What is no plain file is written once, at the end.
+        write: a function (path, content) that writes it.
+    """
+
+    def __init__(self, path: Path | None, write: Callable[[Path, T], None]) -> None:
+        self.path, self.write = path, write
+        self.at_end = path is not None and _written_through(_status(path))
+        self.content: T | None = None  # that is not yet written
+        self.next = 0.0  # when it may be written again
+
+    def update(self, content: T) -> None:
+        """Take what there is now, and write it unless that has just been done."""
+        self.content = content
+        if not self.at_end and time.monotonic() >= self.next:
+            self.close()
+
+    def close(self) -> None:
+        """Write the content that is not yet written."""
+        if self.path is not None and self.content is not None:
+            start = time.monotonic()
+            self.write(self.path, self.content)
+            end = time.monotonic()
+            self.content, self.next = None, end + (end - start) / WRITING

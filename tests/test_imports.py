@@ -27,7 +27,7 @@ ONLY = {
     "env_aec": {"bins", "checks", "game", "geometry", "items", "plan", "render"},
     "game": {"backend", "bins", "checks", "game", "geometry", "items", "plan", "renamed",
              "stability"},
-    "render": {"bins", "geometry", "render"},
+    "render": {"bins", "files", "geometry", "render"},
 }  # fmt: skip
 
 

@@ -22,6 +22,8 @@ from matplotlib.image import imsave
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
+from marl_pack.files import moved_into_place
+
 PALETTE: tuple[str, ...] = (
     "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
     "#ff9da7", "#a0cbe8", "#ffbe7d", "#8cd17d", "#d4a6c8", "#d7b5a6", "#499894", "#b6992d",
@@ -176,7 +178,8 @@ def draw(
 
 def save(path: str | Path, image: NDArray[np.uint8]) -> None:
     """Write a picture uint8 [rows, columns, 3] to a file of the kind its name ends in, e.g. PNG."""
-    imsave(path, image)
+    with moved_into_place(Path(path)) as part:
+        imsave(part, image)
 
 
 def _check(
