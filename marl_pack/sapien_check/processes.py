@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
+import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
+from multiprocessing.connection import Connection
 from typing import TypeVar
 
 from marl_pack.sapien_check.world import SimulationError
@@ -21,14 +23,17 @@ R = TypeVar("R")
 def in_order(task: Callable[[T], R], inputs: Iterable[T], processes: int) -> Iterator[R]:
     """Yield ``task`` of each input in order; several processes work a little ahead.
 
+    The processes end with this generator, and with the process that runs it, however that ends.
+
     Raises:
         SimulationError: if a process dies.
     """
-    # Not forked: torch and PhysX have threads. Ctrl-C is for the process that waits.
-    context = multiprocessing.get_context("spawn")
-    ignore = functools.partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    context = multiprocessing.get_context("spawn")  # not forked: torch and PhysX have threads
+    reader, writer = context.Pipe(duplex=False)  # this process alone has the writer
     source = iter(inputs)
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=ignore) as pool:
+    with reader, ProcessPoolExecutor(
+        processes, mp_context=context, initializer=_follow, initargs=(reader,)
+    ) as pool:  # fmt: skip
         waiting = deque(pool.submit(task, each) for each in islice(source, 2 * processes))
         try:
             while waiting:
@@ -38,4 +43,16 @@ def in_order(task: Callable[[T], R], inputs: Iterable[T], processes: int) -> Ite
         except BrokenProcessPool as error:
             raise SimulationError(f"a process of the judge has died: {error}") from None
         finally:
+            writer.close()
             pool.shutdown(cancel_futures=True)
+
+
+def _follow(reader: Connection) -> None:
+    """Let this process end as soon as the other end of a pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits
+
+    def end() -> None:
+        reader.poll(None)  # nothing is ever sent
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
