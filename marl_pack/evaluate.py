@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from marl_pack.agents.policy import Policy
-from marl_pack.evaluation.rollout import play
+from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
-from marl_pack.files import check_writable, write_json
+from marl_pack.files import Growing, check_writable, write_json
 from marl_pack.options import EPILOG, Setup, add_options, choose
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check.bodies import Bodies
+from marl_pack.sapien_check.judge import Judged, judge_all
 from marl_pack.sapien_check.world import SimulationError, load_sapien
 
 EPISODES = 1000  # of a generated stream, unless --episodes is given
@@ -55,7 +56,7 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
             f"{row['packed']:.2f}",
             f"{row['decisions_per_second']:,.0f}",
             f"{100 * row['strict_equilibrium']:.2f}",
-            *([str(row["falls"])] if physics else []),
+            *([falls_of(row)] if physics else []),
         )
     console.print(table)
     console.print(
@@ -63,6 +64,12 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         "in equilibrium: final stacks in strict equilibrium as a whole"
         + ("\nfalls: episodes in which something fell, in physics" if physics else "")
     )
+
+
+def falls_of(row: dict[str, Any]) -> str:
+    """Return how many episodes fell, and of how many if not all have been judged."""
+    judged = row.get("judged_episodes", 0)
+    return f"{row.get('falls', 0)}" + ("" if judged == row["episodes"] else f" of {judged}")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -118,35 +125,53 @@ def evaluate_policy(
     episodes: int,
     bodies: Bodies | None,
     bar: Progress,
-) -> dict[str, Any]:
-    """Play and judge one policy, save its packings if asked to, and return its row of figures."""
+) -> Iterator[dict[str, Any]]:
+    """Play and judge one policy, and yield its row of figures whenever there is more of it.
+
+    The packings are saved if that is asked for.
+    """
     arguments, console = setup.arguments, bar.console
     task = bar.add_task(f"{name}: episodes", total=episodes)
-    rollout = play(policy, setup.game, episodes, lambda ended: bar.advance(task, ended))
     solving = bar.add_task(f"{name}: equilibria", total=episodes)
-    balanced = np.empty(episodes, np.bool_)
-    for e, plan in enumerate(rollout.plans):
-        balanced[e] = strict_equilibrium(plan)
-        bar.advance(solving)
-    row = summary(rollout, balanced)
+    rollout, balanced = Rollout([], 0.0), np.empty(episodes, np.bool_)
+    stacks = Growing(arguments.save_stacks, save_plans)
+    row: dict[str, Any] = {}
+    try:
+        for part in batches(policy, setup.game, episodes, lambda ended: bar.advance(task, ended)):
+            for e, plan in enumerate(part.plans, len(rollout.plans)):
+                balanced[e] = strict_equilibrium(plan)
+                bar.advance(solving)
+            rollout = Rollout(rollout.plans + part.plans, rollout.seconds + part.seconds)
+            stacks.update(rollout.plans)
+            row = summary(rollout, balanced[: len(rollout.plans)])
+            yield row
+    finally:
+        stacks.close()
     unplayable = int((rollout.packed == 0).sum())
     if unplayable:
         console.print(
             f"{name}: {unplayable} episodes have a first item that may be placed "
             "nowhere; they count as utilization 0"
         )
-    if arguments.save_stacks:
-        save_plans(arguments.save_stacks, rollout.plans)
-    if bodies is not None:
-        judging = bar.add_task(f"{name}: physics", total=episodes)
-        row |= falls(rollout.plans, bodies, arguments.processes, lambda: bar.advance(judging))
-        if row["no_verdict"]:
-            console.print(f"{name}: {row['no_verdict']} episodes without a verdict")
-    return row
+    if bodies is None:
+        return
+    judging = bar.add_task(f"{name}: physics", total=episodes)
+    judged: list[Judged] = []
+    of_all = bodies.stacks(rollout.plans, range(episodes))
+    for verdict in judge_all(of_all, processes=arguments.processes):
+        judged.append(verdict)
+        bar.advance(judging)
+        yield row | falls(judged)
+    unjudged = sum(verdict.error is not None for verdict in judged)
+    if unjudged:
+        console.print(f"{name}: {unjudged} episodes without a verdict")
 
 
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
     """Play the policies that the options choose; return a row of figures for each.
+
+    The figures are written as they come, and what there is of them is shown at the end, also if
+    the program is stopped.
 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
@@ -157,18 +182,26 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         console=console, transient=True,
     )  # fmt: skip
-    with bar:
-        rows = {
-            name: evaluate_policy(name, policy, setup, episodes, bodies, bar)
-            for name, policy in setup.policies.items()
-        }
     title = str(setup)
     if bodies is not None and str(bodies):
         title += f"; {bodies}"
-    show(rows, title, console)
-    if arguments.json:
-        report = {"settings": setup.settings | {"episodes": episodes}, "policies": rows}
-        write_json(arguments.json, report)
+    rows: dict[str, dict[str, Any]] = {}
+    report = {
+        "settings": setup.settings | {"episodes": episodes}, "complete": False, "policies": rows
+    }  # fmt: skip
+    growing = Growing(arguments.json, write_json)
+    try:
+        with bar:
+            for name, policy in setup.policies.items():
+                for row in evaluate_policy(name, policy, setup, episodes, bodies, bar):
+                    rows[name] = row
+                    growing.update(report)
+        report["complete"] = True
+        growing.update(report)
+    finally:
+        if rows:
+            show(rows, title, console)
+        growing.close()
     return rows
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,20 @@ def play(
 ) -> Rollout:
     """Play episodes 0 … episodes - 1 to their end.
 
+    Args: as :func:`batches`.
+    """
+    parts = list(batches(policy, game, episodes, progress))
+    return Rollout([plan for part in parts for plan in part.plans], sum(p.seconds for p in parts))
+
+
+def batches(
+    policy: Policy,
+    game: Callable[[int, int], Packing],
+    episodes: int,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Iterator[Rollout]:
+    """Play episodes 0 … episodes - 1, and yield those of each batch once it has ended.
+
     Args:
         policy: of both agents.
         game: (n, first_episode) → n games without ``auto_reset``.
@@ -54,10 +68,8 @@ def play(
         ValueError: unless ``episodes`` is a whole number ≥ 1.
     """
     episodes = whole_number(episodes, "episodes", 1)
-    plans: list[Plan] = []
     width, depth, _ = game(1, 0).size
     batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))
-    seconds = 0.0
     for first in range(0, episodes, batch):
         games = game(min(batch, episodes - first), first)
         progress(int((~games.alive).sum()))
@@ -65,6 +77,4 @@ def play(
         while bool(games.alive.any()):
             outcome = games.place(*policy(games))
             progress(int(outcome.done.sum()))
-        seconds += time.perf_counter() - start
-        plans += games.plans()
-    return Rollout(plans, seconds)
+        yield Rollout(games.plans(), time.perf_counter() - start)

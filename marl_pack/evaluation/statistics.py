@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ from scipy import stats
 
 from marl_pack.evaluation.rollout import Rollout
 from marl_pack.plan import Plan
-from marl_pack.sapien_check.bodies import Bodies
-from marl_pack.sapien_check.judge import judge_all
+from marl_pack.sapien_check.judge import Judged
 from marl_pack.stability import in_equilibrium
 
 
@@ -73,25 +72,17 @@ def strict_equilibrium(plan: Plan) -> bool:
     return all(in_equilibrium(own.boxes, own.loads) for own in bins)
 
 
-def falls(
-    plans: Sequence[Plan],
-    bodies: Bodies,
-    processes: int = 1,
-    progress: Callable[[], object] = lambda: None,
-) -> dict[str, Any]:
-    """Judge every packing in physics, after each placement up to its first fall.
+def falls(results: Sequence[Judged]) -> dict[str, Any]:
+    """Compute the figures of packings judged in physics.
 
     Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
-    judged), ``judged`` (placements) and ``judge_seconds`` (of one placement).
+    judged), ``judged_episodes``, ``judged`` (placements) and ``judge_seconds`` (of one placement).
     """
-    results = []
-    for result in judge_all(bodies.stacks(plans, range(len(plans))), processes=processes):
-        results.append(result)
-        progress()
     placements = sum(result.placements for result in results)
     return {
         "falls": sum(result.fall is not None for result in results),
         "no_verdict": sum(result.error is not None for result in results),
+        "judged_episodes": len(results),
         "judged": placements,
         "judge_seconds": sum(result.seconds for result in results) / max(placements, 1),
     }

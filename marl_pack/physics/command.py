@@ -12,7 +12,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,11 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from marl_pack.files import check_writable, write_json
+from marl_pack.files import Growing, check_writable, write_json
 from marl_pack.physics import controls, table1
 from marl_pack.physics.options import add_body_options, chosen_bodies
 from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, Verdict, judge_all
 from marl_pack.sapien_check.stack import Stack
 from marl_pack.sapien_check.world import DEFAULT, Physics, SimulationError
@@ -59,23 +60,47 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
     if options.save_falls is not None:
         for rule in rules:
             check_writable(falls_file(options.save_falls, rule))
-    with _progress(console) as bar:
-        for rule in rules:
-            settings = table1.Settings(rule, options.seed, options.physics)
-            task = bar.add_task(f"{rule}: objects", total=options.objects)
-            trials = table1.run(
-                settings, options.objects, options.processes,
-                lambda done, task=task: bar.advance(task, done),  # type: ignore[misc]  # a default argument binds the task
-            )  # fmt: skip
-            rows[rule] = table1.summary(trials)
-            if options.save_falls and rows[rule]["falls"]:
-                path = falls_file(options.save_falls, rule)
-                save_plans(path, table1.fallen(trials))
-                console.print(f"{path}: the bins in which something fell", soft_wrap=True)
-    show_table1(rows, console, f"Table 1, {options.objects:,} objects a rule, seed {options.seed}")
-    report = {"objects": options.objects, "seed": options.seed, "physics": asdict(options.physics)}
-    if options.json is not None:
-        write_json(options.json, report | {"rules": rows, "paper": table1.PAPER})
+    report = {
+        "objects": options.objects, "seed": options.seed, "physics": asdict(options.physics),
+        "complete": False, "rules": rows, "paper": table1.PAPER,
+    }  # fmt: skip
+    growing = Growing(options.json, write_json)
+    try:
+        with _progress(console) as bar:
+            for rule in rules:
+                for row in judged_rule(rule, options, bar):
+                    rows[rule] = row
+                    growing.update(report)
+        report["complete"] = True
+        growing.update(report)
+    finally:
+        if rows:
+            title = f"Table 1, {options.objects:,} objects a rule, seed {options.seed}"
+            show_table1(rows, console, title)
+        growing.close()
+
+
+def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterator[dict[str, Any]]:
+    """Play and judge one rule, and yield its row of the table after each bin.
+
+    The bins in which something fell are saved if that is asked for.
+    """
+    task = bar.add_task(f"{rule}: objects", total=options.objects)
+    path = options.save_falls and falls_file(options.save_falls, rule)
+    falls = Growing(path, save_plans)
+    settings = table1.Settings(rule, options.seed, options.physics)
+    trials: list[table1.Trial] = []
+    try:
+        for trial in table1.run(settings, options.objects, options.processes):
+            trials.append(trial)
+            bar.advance(task, len(trial.plan))
+            if table1.fallen([trial]):
+                falls.update(table1.fallen(trials))
+            yield table1.summary(trials)
+    finally:
+        falls.close()
+        if path and table1.fallen(trials):
+            bar.console.print(f"{path}: the bins in which something fell", soft_wrap=True)
 
 
 def falls_file(path: Path, rule: str) -> Path:
@@ -198,17 +223,29 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
         title = f"{options.file.stem}, episode {chosen[0]}"
         draw(bodies.stack(plans[chosen[0]], chosen[0]), title, options, console)
     judged: dict[int, Judged] = {}
-    with _progress(console) as bar:
-        task = bar.add_task("episodes", total=len(chosen))
-        stacks = bodies.stacks(plans, chosen)
-        verdicts = judge_all(stacks, options.physics, options.processes)
-        for e, verdict in zip(chosen, verdicts, strict=True):
-            judged[e] = verdict
-            bar.advance(task)
-    show_judged(judged, console)
-    report = {
-        "file": str(options.file), "packings": len(judged),
-        "placements": sum(j.placements for j in judged.values()),
+    growing = Growing(options.json, write_json)
+    try:
+        with _progress(console) as bar:
+            task = bar.add_task("episodes", total=len(chosen))
+            stacks = bodies.stacks(plans, chosen)
+            verdicts = judge_all(stacks, options.physics, options.processes)
+            for e, verdict in zip(chosen, verdicts, strict=True):
+                judged[e] = verdict
+                growing.update(stack_report(judged, chosen, bodies, options))
+                bar.advance(task)
+    finally:
+        if judged:
+            show_judged(judged, console)
+        growing.close()
+
+
+def stack_report(
+    judged: dict[int, Judged], chosen: Sequence[int], bodies: Bodies, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Return the figures of the packings that have been judged, of those that were chosen."""
+    return {
+        "file": str(options.file), "complete": len(judged) == len(chosen),
+        "packings": len(judged), "placements": sum(j.placements for j in judged.values()),
         "bodies": asdict(bodies), "physics": asdict(options.physics),
         "falls": [
             {"episode": e, "boxes": len(j.fall.distance), "moved": j.fall.moved,
@@ -217,8 +254,6 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
         ],
         "errors": {e: j.error for e, j in judged.items() if j.error is not None},
     }  # fmt: skip
-    if options.json is not None:
-        write_json(options.json, report)
 
 
 def show_judged(judged: dict[int, Judged], console: Console) -> None:

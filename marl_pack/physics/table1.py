@@ -8,7 +8,7 @@ or something has fallen.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from itertools import count
@@ -117,12 +117,7 @@ def fill(settings: Settings, number: int) -> Trial:
     return Trial(plan, *map(np.array, zip(*rows, strict=True)))
 
 
-def run(
-    settings: Settings,
-    objects: int,
-    processes: int = 1,
-    progress: Callable[[int], object] = lambda done: None,
-) -> list[Trial]:
+def run(settings: Settings, objects: int, processes: int = 1) -> Iterator[Trial]:
     """Fill bin after bin until so many objects have been placed; the last trial is cut short.
 
     The objects do not depend on the number of processes.
@@ -131,21 +126,17 @@ def run(
         settings: rule, seed and physics.
         objects: number of placements, 1 or more.
         processes: that work at once.
-        progress: called with the number of objects of each trial.
     """
-    trials: list[Trial] = []
     left = objects
     task = partial(fill, settings)
-    for trial in map(task, count()) if processes == 1 else in_order(task, count(), processes):
-        trials.append(trial.first(left))
-        left -= len(trials[-1].plan)
-        progress(len(trials[-1].plan))
-        if not left:
-            break
-    return trials
+    trials = map(task, count()) if processes == 1 else in_order(task, count(), processes)
+    while left:
+        trial = next(trials).first(left)
+        left -= len(trial.plan)
+        yield trial
 
 
-def summary(trials: list[Trial]) -> dict[str, Any]:
+def summary(trials: Sequence[Trial]) -> dict[str, Any]:
     """Compute the figures of one row of the table; times in seconds."""
     stands, equilibrium, mask, judge = (
         np.concatenate([getattr(trial, name) for trial in trials])
@@ -166,6 +157,6 @@ def summary(trials: list[Trial]) -> dict[str, Any]:
     }
 
 
-def fallen(trials: list[Trial]) -> list[Plan]:
+def fallen(trials: Sequence[Trial]) -> list[Plan]:
     """Return the plans of the bins in which something fell."""
     return [trial.plan for trial in trials if not trial.stands[-1]]
