@@ -8,10 +8,10 @@ resolved settings, checkpoints, TensorBoard's logs and the history of evaluation
 from __future__ import annotations
 
 import argparse
-import contextlib
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,20 @@ from marl_pack.agents.learning.runner import RunInterruptedError, Runner, Traini
 from marl_pack.config import Config, ConfigError, parse
 from marl_pack.training.assembly import evaluation, make_runner, rank
 from marl_pack.training.display import Display
-from marl_pack.training.folder import new_folder, resumed, write_history, write_record
+from marl_pack.training.folder import (
+    new_run,
+    resumed,
+    run_to_resume,
+    write_history,
+    write_record,
+)
 
 
 def train(
     config: Config,
     folder: Path,
     console: Console,
+    arguments: Sequence[str],
     checkpoint: Mapping[str, Any] | None = None,
 ) -> Runner:
     """Run the training of a run to its end.
@@ -37,6 +44,7 @@ def train(
         config: the settings.
         folder: the run's.
         console: where progress goes.
+        arguments: of the command, for the record.
         checkpoint: of the run to resume.
 
     Raises:
@@ -60,7 +68,7 @@ def train(
         evaluated=evaluated,
     )
     if rank() == 0:
-        write_record(folder, config, sys.argv[1:])
+        write_record(folder, config, arguments)
 
     def stop(number: int, frame: object) -> None:
         if runner.stop_requested:  # a second signal stops at once
@@ -88,19 +96,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.train``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     console = Console()
-    run, folder = None, None
+    folder = None
     try:
         run, rest = _resume_option(words)
-        checkpoint = None
-        if run is not None:
-            config, checkpoint = resumed(run, rest)
-            folder = Path(run) if Path(run).is_dir() else Path(run).parent
-        else:
+        if run is None:
             config, _ = parse(words)
-            folder = new_folder(config) if rank() == 0 else Path(config.output.folder)
-        if rank() == 0:
-            console.print(f"run: {folder}", soft_wrap=True)
-        runner = train(config, folder, console if rank() == 0 else Console(quiet=True), checkpoint)
+            claim = new_run(config) if rank() == 0 else nullcontext(Path(config.output.folder))
+        else:
+            claim = run_to_resume(run) if rank() == 0 else nullcontext(Path(run))
+        with claim as folder:
+            checkpoint = None
+            if run is not None:
+                config, checkpoint = resumed(run, rest)
+            if rank() == 0:
+                console.print(f"run: {folder}", soft_wrap=True)
+            quiet = Console(quiet=True)
+            runner = train(config, folder, console if rank() == 0 else quiet, words, checkpoint)
     except RunInterruptedError:
         if rank() == 0:
             console.print(
@@ -114,10 +125,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"python -m marl_pack.train: {error}", file=sys.stderr)
         return 1
     except (ConfigError, OSError, ModuleNotFoundError) as error:
-        if run is None and rank() == 0 and folder is not None:
-            with contextlib.suppress(OSError):  # the run has not begun, unless the folder has files
-                folder.rmdir()
-        print(f"python -m marl_pack.train: {error}", file=sys.stderr)
+        nameless = isinstance(error, OSError) and error.errno and not error.filename
+        where = f"{folder}: " if nameless else ""  # as where logs are written
+        print(f"python -m marl_pack.train: {where}{error}", file=sys.stderr)
         return 2
     if rank() == 0:
         console.print(

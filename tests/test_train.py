@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import same
+from filelock import FileLock
+from fuzz import killed_runs
+from small_runs import same, small_disk
 from torch import Tensor
 
 from marl_pack.agents.learning import checkpoint as checkpoints
@@ -60,7 +62,8 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
 def test_a_run_leaves_settings_checkpoints_logs_and_history(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]) == 0
+    arguments = [*SMALL, "--ppo.max_iterations=4", f"--output.folder={tmp_path}"]
+    assert main(arguments) == 0
     run = tmp_path / "run"
     names = {path.name for path in run.iterdir()}
     assert {"config.yaml", "run.json", "latest.pt", "best.pt", "evaluations.csv",
@@ -68,6 +71,7 @@ def test_a_run_leaves_settings_checkpoints_logs_and_history(
     assert not [name for name in names if name.endswith(".part")]
     record = json.loads((run / "run.json").read_text())
     assert record["versions"]["torch"] == torch.__version__
+    assert record["arguments"] == arguments
     rows = list(csv.DictReader((run / "evaluations.csv").open()))
     assert [row["iteration"] for row in rows] == ["2", "4"]
     assert [row["items"] for row in rows] == ["64", "128"]
@@ -276,6 +280,76 @@ def test_a_run_can_be_resumed_from_its_very_start(tmp_path: Path) -> None:
     assert checkpoints.read(run / "latest.pt")["iter"] == -1
     assert main(["--resume", str(run)]) == 0
     assert same(networks(run), networks(tmp_path / "whole" / "run"))
+
+
+def test_runs_killed_at_random_moments_end_with_the_same_weights() -> None:
+    assert killed_runs.main(["--runs", "2", "--seed", "3"]) == 0
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [*SMALL, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    assert main([*options, "--output.name=whole"]) == 0
+    run.mkdir()  # all that there is when it is killed at once
+    assert main(["--resume", str(run)]) == 2
+    assert "no run has begun there; train it without --resume" in capsys.readouterr().err
+    assert main(options) == 0
+    assert same(networks(run), networks(whole))
+    shutil.rmtree(run)
+    run.mkdir()
+    for name in ("config.yaml", "run.json"):  # what there is when it is killed a moment later
+        shutil.copy(whole / name, run)
+    (run / ".part-0123.pt").write_text("not whole")
+    assert main(["--resume", str(run), "--game.bin=[6,6,6]"]) == 2
+    assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in capsys.readouterr().err
+    assert main(["--resume", str(run)]) == 0
+    assert same(networks(run), networks(whole))
+    assert json.loads((run / "run.json").read_text())["resumed"][0]["arguments"][0] == "--resume"
+    assert not list(run.glob(".part-*"))
+    (run / "latest.pt").unlink()
+    assert main(["--resume", str(run)]) == 2
+    assert f"{run}: needs latest.pt, as a run's folder has it" in capsys.readouterr().err
+
+
+def test_a_run_is_trained_by_one_process_and_resumed_with_its_own_record(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    options = [*SMALL, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]
+    assert main(options) == 0
+    before = (run / "latest.pt").read_bytes()
+    capsys.readouterr()
+    more = ["--resume", str(run), "--ppo.max_iterations=2"]
+    with FileLock(run / ".lock"):
+        assert main(more) == 2
+    errors = capsys.readouterr().err.splitlines()
+    program = "python -m marl_pack.train"
+    assert errors == [f"{program}: {run}: another process trains this run; wait for its end"]
+    for content in (b"", b"{", b"[]", b"\xff", b'{"arguments": 3}', b"[" * 100_000):
+        (run / "run.json").write_bytes(content)
+        assert main(more) == 2
+        (error,) = capsys.readouterr().err.splitlines()
+        assert error.startswith(f"{program}: {run / 'run.json'}: not the record of a run")
+    assert (run / "latest.pt").read_bytes() == before
+    (run / "run.json").unlink()
+    assert main(more) == 0
+
+
+def test_a_full_disk_ends_a_run_with_the_files_name_and_leaves_its_last_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert main([*SMALL, "--ppo.max_iterations=1", f"--output.folder={tmp_path}"]) == 0
+    before = (run / "latest.pt").read_bytes()
+    capsys.readouterr()
+    with small_disk(40_000):
+        assert main(["--resume", str(run), "--ppo.max_iterations=2"]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.endswith(f"File too large: '{run / 'latest.pt'}'")
+    assert (run / "latest.pt").read_bytes() == before
+    assert not list(run.glob(".part-*"))
 
 
 def test_evaluations_on_other_sequences_are_not_compared(tmp_path: Path) -> None:

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import datetime
 import io
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
+from filelock import FileLock, Timeout
 
 import marl_pack
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.resuming import check_progress
 from marl_pack.agents.loading import trained_game
 from marl_pack.config import Config, ConfigError, from_dict, parse
-from marl_pack.files import write_atomically
+from marl_pack.files import PART, remove_unfinished, write_atomically, write_json
 
 PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
+SETTINGS, RECORD, LOCK = "config.yaml", "run.json", ".lock"
+BEFORE_THE_RUN = {SETTINGS, RECORD, LOCK}  # files that precede the first checkpoint
 MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
 
 
@@ -38,13 +42,15 @@ def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
-    """Write the settings, the command and the packages' versions beside the checkpoints."""
+    """Write the settings, the command and the packages' versions beside the checkpoints.
+
+    The record of a run that is resumed keeps that of its start.
+    """
     text = yaml.safe_dump(config.to_dict(), sort_keys=False)
-    write_atomically(folder / "config.yaml", lambda file: file.write(text.encode()))
+    write_atomically(folder / SETTINGS, lambda file: file.write(text.encode()))
     versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
     versions |= {name: metadata.version(name) for name in PACKAGES}
-    path = folder / "run.json"
-    before = json.loads(path.read_text()) if path.is_file() else None
+    before = read_record(folder)
     record: dict[str, Any] = {
         "arguments": list(arguments),
         "seed": config.seed,
@@ -55,45 +61,144 @@ def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None
     if before is not None:  # the run is resumed: keep the record of its start
         before.setdefault("resumed", []).append(record)
         record = before
-    record_text = json.dumps(record, indent=2) + "\n"
-    write_atomically(path, lambda file: file.write(record_text.encode()))
+    write_json(folder / RECORD, record)
 
 
-def new_folder(config: Config) -> Path:
-    """Make the folder of a new run and return it; no two runs share one.
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """Return the record of a run; None if there is none.
 
     Raises:
-        ConfigError: if the folder exists or cannot be made.
+        ConfigError: if the file is not such a record.
+    """
+    path = folder / RECORD
+    if not path.exists():
+        return None
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(record["arguments"], list) and isinstance(record.get("resumed", []), list):
+            return dict(record)
+    except (ValueError, TypeError, KeyError, RecursionError):
+        pass
+    raise ConfigError(
+        f"{path}: not the record of a run; move it away, resuming needs {checkpoints.LATEST} alone"
+    )
+
+
+def _check_free(folder: Path) -> None:
+    """Refuse a folder that holds more than what a run writes before its first checkpoint.
+
+    Raises:
+        ConfigError: saying what would be right.
+    """
+    if (folder / checkpoints.LATEST).exists():
+        raise ConfigError(
+            f"output.name: {folder} holds a run; --resume {folder} continues it; or name another"
+        )
+    if folder.exists() and (not folder.is_dir() or _holds_more(folder)):
+        raise ConfigError(f"output.name: {folder} exists already; name another")
+
+
+def _holds_more(folder: Path) -> bool:
+    """Return whether a folder holds more than what a run writes before its first checkpoint."""
+    names = (path.name for path in folder.iterdir())
+    return any(name not in BEFORE_THE_RUN and not name.startswith(PART) for name in names)
+
+
+@contextlib.contextmanager
+def _claimed(folder: Path) -> Iterator[None]:
+    """Keep other processes from training in a folder; remove it if nothing was written there.
+
+    Raises:
+        ConfigError: if a process trains there already.
+    """
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise ConfigError(f"{folder}: another process trains this run; wait for its end") from None
+    try:
+        remove_unfinished(folder)
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # it is gone, or another process begins a run there
+            if os.listdir(folder) == [LOCK]:
+                (folder / LOCK).unlink()
+                folder.rmdir()
+        lock.release()
+
+
+@contextlib.contextmanager
+def new_run(config: Config) -> Iterator[Path]:
+    """Make the folder of a new run, which no other process uses meanwhile.
+
+    A run that was killed before its first checkpoint has lost nothing: its folder is free.
+
+    Raises:
+        ConfigError: if the folder holds something else or cannot be made.
     """
     name = config.output.name
     if name is None:
         name = f"{datetime.datetime.now():%Y-%m-%d_%H-%M-%S}_seed{config.seed}"
     folder = Path(config.output.folder) / name
-    if (folder / checkpoints.LATEST).exists():
-        raise ConfigError(
-            f"output.name: {folder} holds a run; --resume {folder} continues it; or name another"
-        )
+    _check_free(folder)
     try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise ConfigError(f"output.name: {folder} exists already; name another") from None
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"output.folder: {error}") from None
-    return folder
+    with _claimed(folder):
+        _check_free(folder)  # another process may have trained there meanwhile
+        for file in (SETTINGS, RECORD):
+            (folder / file).unlink(missing_ok=True)
+        yield folder
 
 
-def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]:
+@contextlib.contextmanager
+def run_to_resume(run: str) -> Iterator[Path]:
+    """Return the folder of a run that is to be resumed, which no other process uses meanwhile.
+
+    Args:
+        run: its folder, or its checkpoint.
+
+    Raises:
+        ConfigError: if there is no run.
+    """
+    path = Path(run)
+    if not path.is_dir() and not path.is_file():
+        raise ConfigError(f"{run}: no such checkpoint")
+    folder = path if path.is_dir() else path.parent
+    if path == folder and not (path / checkpoints.LATEST).exists():
+        if _holds_more(folder):
+            raise ConfigError(f"{run}: needs {checkpoints.LATEST}, as a run's folder has it")
+        if not (folder / SETTINGS).exists():
+            raise ConfigError(f"{run}: no run has begun there; train it without --resume")
+    with _claimed(folder):
+        yield folder
+
+
+def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] | None]:
     """Return the settings and the latest checkpoint of a run to resume.
+
+    A run that was killed before its first checkpoint has none: it begins again.
+
+    Args:
+        run: its folder, or its checkpoint.
+        arguments: of the command line, but for --resume.
 
     Raises:
         ConfigError, FileNotFoundError: if the run cannot be resumed with these arguments.
     """
-    folder = Path(run)
-    try:
-        checkpoint = checkpoints.read(folder / checkpoints.LATEST if folder.is_dir() else folder)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    own = from_dict(checkpoint["config"])
+    path, checkpoint = Path(run), None
+    if path.is_dir():
+        read_record(path)
+        path = path / checkpoints.LATEST
+    if path.exists():
+        try:
+            checkpoint = checkpoints.read(path)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        own = from_dict(checkpoint["config"])
+    else:
+        own, _ = parse([f"--config={path.with_name(SETTINGS)}"])
     config, options = parse(["--config", yaml.safe_dump(own.to_dict()), *arguments])
     if len(options.config or []) > 1:
         raise ConfigError("--resume: needs no --config, as the run has its own settings")
@@ -104,8 +209,10 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any]]
                 f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
                 "output.*, evaluation.* and ppo.max_iterations may change"
             )
-    _check_size(own, checkpoint)
-    done = checkpoint["iter"] + 1
+    done = 0
+    if checkpoint is not None:
+        _check_size(own, checkpoint)
+        done = checkpoint["iter"] + 1
     if config.ppo.max_iterations < min(done, own.ppo.max_iterations):
         raise ConfigError(
             f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
