@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -22,6 +21,7 @@ from marl_pack.backend import Backend, default_backend
 from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
 from marl_pack.geometry.tensor import footprint, place_boxes
+from marl_pack.installation import njit
 
 UNKNOWN = -1
 """Label of a box whose item or orientation is not known."""

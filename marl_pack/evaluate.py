@@ -15,22 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from marl_pack.agents.policy import Policy
+from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
 from marl_pack.files import Growing, check_writable, write_json
-from marl_pack.options import EPILOG, Setup, add_options, choose
+from marl_pack.options import EPILOG, MOST_AT_ONCE, Setup, add_options, choose, set_threads
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, judge_all
 from marl_pack.sapien_check.world import SimulationError, load_sapien
+from marl_pack.terminal import Parser, make_console, make_progress
 
 EPISODES = 1000  # of a generated stream, unless --episodes is given
 
@@ -72,9 +73,9 @@ def falls_of(row: dict[str, Any]) -> str:
     return f"{row.get('falls', 0)}" + ("" if judged == row["episodes"] else f" of {judged}")
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command's options."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="python -m marl_pack.evaluate",
         description=__doc__.split("\n\n")[0],
         epilog=EPILOG,
@@ -107,8 +108,7 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
         load_sapien()  # if it is not installed, its error comes before the games
     elif any(getattr(arguments, key) is not None for key in BODY_OPTIONS):
         raise ValueError("--cell, --density and --com-spread go with --physics")
-    if arguments.processes < 1:
-        raise ValueError(f"--processes {arguments.processes}: needs 1 or more")
+    whole_number(arguments.processes, "--processes", 1, MOST_AT_ONCE)
     episodes, available = arguments.episodes, setup.stream.episodes
     if episodes is None:
         episodes = available or EPISODES
@@ -178,10 +178,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     """
     setup = choose(arguments, console)
     episodes, bodies = check_options(arguments, setup)
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
-    )  # fmt: skip
+    bar = make_progress(console)
     title = str(setup)
     if bodies is not None and str(bodies):
         title += f"; {bodies}"
@@ -209,15 +206,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.evaluate``; return its exit status."""
     options = parser()
     chosen = options.parse_args(arguments)
-    torch.set_num_threads(max(1, chosen.threads))
     try:
-        run(chosen, Console())
+        set_threads(chosen.threads)
+        run(chosen, make_console())
     except SimulationError as error:  # a process of the judge has died
-        options.exit(1, f"{options.prog}: {error}\n")
+        options.exit(1, f"{options.prog}: {error}")
     except KeyboardInterrupt:
-        options.exit(130, f"{options.prog}: interrupted\n")
+        options.exit(130, f"{options.prog}: interrupted")
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        options.exit(2, f"{options.prog}: {error}\n")
+        options.exit(2, f"{options.prog}: {error}")
     return 0
 
 

@@ -8,7 +8,6 @@ and is never the best.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import sys
 import warnings
@@ -29,6 +28,8 @@ from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.files import write_atomically
 from marl_pack.game.packing import Packing
+from marl_pack.installation import missing
+from marl_pack.terminal import Parser, make_console
 
 OPSET = 18
 
@@ -176,9 +177,7 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.export``; return its exit status."""
-    options = argparse.ArgumentParser(
-        prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0]
-    )
+    options = Parser(prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0])
     options.add_argument("checkpoint", help="a checkpoint or a run's folder")
     options.add_argument(
         "--format", choices=["onnx", "rsl_rl"], default="onnx",
@@ -188,11 +187,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = options.parse_args(arguments)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
-        run(chosen.checkpoint, chosen.folder, chosen.format, Console())
+        run(chosen.checkpoint, chosen.folder, chosen.format, make_console())
     except ModuleNotFoundError as error:
-        options.exit(2, f"{options.prog}: {error}; install marl_pack[export]\n")
+        options.exit(2, f"{options.prog}: {missing(error, 'ONNX needs two packages', 'export')}")
     except (ValueError, OSError) as error:
-        options.exit(2, f"{options.prog}: {error}\n")
+        options.exit(2, f"{options.prog}: {error}")
     return 0
 
 

@@ -10,11 +10,13 @@ import argparse
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
+from marl_pack.checks import whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, add_arguments, given_options
 from marl_pack.geometry import Size
@@ -27,6 +29,10 @@ from marl_pack.items import (
     make_stream,
 )
 
+LARGEST_SEED = 2**64 - 1
+"""The largest seed; random numbers have 64 bits."""
+MOST_AT_ONCE = 1024
+"""The largest number of threads, and of processes that judge."""
 EPILOG = (
     "The game is the one that the first checkpoint among the policies was trained on, else RS in a "
     "bin of 10 x 10 x 10 under hull_alpha; each option changes that."
@@ -97,6 +103,15 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add("--threads", type=int, default=1, help="on the CPU (default: 1)")
 
 
+def set_threads(threads: int) -> None:
+    """Set the number of threads on the CPU.
+
+    Raises:
+        ValueError: unless it is a whole number that a computer can run.
+    """
+    torch.set_num_threads(whole_number(threads, "--threads", 1, MOST_AT_ONCE))
+
+
 def choose(arguments: argparse.Namespace, console: Console) -> Setup:
     """Return the players and the game that the options name.
 
@@ -108,8 +123,7 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
     check_device(arguments.device)
-    if arguments.seed < 0:
-        raise ValueError(f"--seed {arguments.seed}: needs 0 or more")
+    whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
     policies, learned = choose_policies(arguments, console)
     stream, items, sides, spec = choose_game(arguments, learned)
     if arguments.plan is not None:

@@ -11,20 +11,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.table import Table
 
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.options import EPILOG, add_options, choose
+from marl_pack.options import EPILOG, add_options, choose, set_threads
 from marl_pack.plan import Plan
+from marl_pack.terminal import Parser, make_console
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command's options."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="python -m marl_pack.play",
         description=__doc__.split("\n\n")[0],
         epilog=EPILOG,
@@ -92,13 +92,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.play``; return its exit status."""
     options = parser()
     chosen = options.parse_args(arguments)
-    torch.set_num_threads(max(1, chosen.threads))
     try:
-        run(chosen, Console())
+        set_threads(chosen.threads)
+        run(chosen, make_console())
     except KeyboardInterrupt:
-        options.exit(130, f"{options.prog}: interrupted\n")
+        options.exit(130, f"{options.prog}: interrupted")
     except (ValueError, OSError) as error:
-        options.exit(2, f"{options.prog}: {error}\n")
+        options.exit(2, f"{options.prog}: {error}")
     return 0
 
 

@@ -1,8 +1,9 @@
-"""Old names and what they are called now, for old checkpoints and for messages."""
+"""Old names and what they are called now, and the nearest valid name for messages."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterable, Mapping
 
 PLANES = {
     "rest": "resting_height",
@@ -21,6 +22,16 @@ AGENT_KEYS = {"imitate": "teacher", "imitate_iterations": "teacher_iterations"}
 
 OPTIONS = {"size": "bin", "rule_parameters": "margin or thresholds"}
 """Keyword arguments that games took (:class:`marl_pack.game.spec.GameSpec`)."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str | None:
+    """Return the valid name that ``name`` most probably means, or None."""
+    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
+
+
+def did_you_mean(name: str | None) -> str:
+    """Return the end of a sentence that asks for the nearest valid name; empty without one."""
+    return f"; did you mean {name!r}?" if name else "."
 
 
 def refuse_old(name: str, names: Mapping[str, str], kind: str) -> None:

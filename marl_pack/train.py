@@ -20,6 +20,7 @@ from rich.console import Console
 
 from marl_pack.agents.learning.runner import RunInterruptedError, Runner, TrainingDivergedError
 from marl_pack.config import Config, ConfigError, parse
+from marl_pack.terminal import complain, make_console
 from marl_pack.training.assembly import evaluation, make_runner, rank
 from marl_pack.training.display import Display
 from marl_pack.training.folder import (
@@ -95,7 +96,7 @@ def train(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.train``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    console = Console()
+    console = make_console()
     folder = None
     try:
         run, rest = _resume_option(words)
@@ -110,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 config, checkpoint = resumed(run, rest)
             if rank() == 0:
                 console.print(f"run: {folder}", soft_wrap=True)
-            quiet = Console(quiet=True)
+            quiet = make_console(quiet=True)
             runner = train(config, folder, console if rank() == 0 else quiet, words, checkpoint)
     except RunInterruptedError:
         if rank() == 0:
@@ -122,12 +123,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print("stopped at once; the last checkpoint is as it was")
         return 130
     except TrainingDivergedError as error:
-        print(f"python -m marl_pack.train: {error}", file=sys.stderr)
+        complain("python -m marl_pack.train", error)
         return 1
     except (ConfigError, OSError, ModuleNotFoundError) as error:
         nameless = isinstance(error, OSError) and error.errno and not error.filename
         where = f"{folder}: " if nameless else ""  # as where logs are written
-        print(f"python -m marl_pack.train: {where}{error}", file=sys.stderr)
+        complain("python -m marl_pack.train", f"{where}{error}")
         return 2
     if rank() == 0:
         console.print(

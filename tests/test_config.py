@@ -1,10 +1,12 @@
 """The settings: every key explained, every file loads and runs, mistakes named."""
 
 import re
+from itertools import islice
 from pathlib import Path
 
 import pytest
 import yaml
+from fuzz.configs import LAUGHS, as_yaml, cases
 
 from marl_pack.config import Agent, Config, ConfigError, from_dict, keys, make_parser, parse
 from marl_pack.train import main
@@ -70,25 +72,28 @@ def test_settings_go_to_plain_values_and_back() -> None:
 
 
 @pytest.mark.parametrize(("options", "expected"), [
-    (["--ppo.gama=0.9"], r"unknown key ppo\.gama\. Did you mean ppo\.gamma\? Keys in ppo: clip"),
-    (["--sed=1"], r"unknown key sed\. Did you mean seed\? Keys: device, evaluation"),
-    (["--ppo.gamma=much"], r"ppo\.gamma.*float.*much"),
+    (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: clip"),
+    (["--sed=1"], r"unknown key 'sed'; did you mean 'seed'\? Keys: device, evaluation"),
+    (["--ppo.gamma=much"], r"^ppo\.gamma = much: needs a number$"),
     (["--game.rule=hull"], r"game: unknown stability rule 'hull': one of hull_1, hull_alpha"),
-    (["--game.rule=null"], r"game: unknown stability rule None: one of hull_1"),
-    (["--game.mask_orientations=null"], r"game\.mask_orientations.*Expected bool"),
+    (["--game.rule=null"], r"game\.rule = null: needs the name of a rule"),
+    (["--game.mask_orientations=null"], r"^game\.mask_orientations = null: needs true or false$"),
     (["--game.margin=-1"], r"game: margin = -1\.0: needs a number of cells ≥ 0"),
     (["--game.max_items=0"], r"game: max_items = 0: needs a whole number ≥ 1"),
-    (["--game.max_item=3"], r"unknown key game\.max_item\. Did you mean game\.max_items\?"),
+    (["--game.max_item=3"], r"key 'game\.max_item'; did you mean 'game\.max_items'\?"),
     (["--orientation.imitate=dblf"], r"imitate: it is now called orientation\.teacher$"),
     (["--placement.network.planes=[room]"], r"plane 'room' is now called 'feasible_cells'"),
-    (["--game.bin=[10,10]"], r"game\.bin"),
+    (["--game.bin=[10,10]"], r"^game\.bin = \[10, 10\]: needs a list of 3 whole numbers, such as "),
+    (["--game.bin", "7,5,9"], r"^game\.bin = 7,5,9: needs a list of 3 whole numbers"),
+    (["--game.bin", "7", "5", "9"], r"^5 9: belongs to no key; a list is one word, such as"),
     (["--game.bin=[10,10,0]"], r"game: bin size \(10, 10, 0\)"),
-    (["--ppo.gamma=1.5"], r"ppo\.gamma = 1\.5: needs a number from 0 to 1"),
+    (["--ppo.gamma=1.5"], r"ppo\.gamma = 1\.5: needs a number from 0 to 1$"),
     (["--ppo.learning_rate=.nan"], r"ppo\.learning_rate = nan: needs a positive"),
-    (["--placement.entropy_coef=-1"], r"placement = -1\.0"),
-    (["--ppo.num_envs=0"], r"ppo\.num_envs = 0: needs 1 or more"),
+    (["--placement.entropy_coef=-1"], r"placement\.entropy_coef = -1\.0: needs a number from 0 to"),
+    (["--ppo.num_envs=0"], r"ppo\.num_envs = 0: needs a number from 1 to"),
     (["--ppo.num_envs=1", "--ppo.num_steps_per_env=2"], r"an iteration has only 2"),
-    (["--threads=0"], r"threads = 0"),
+    (["--threads=0"], r"threads = 0: needs a number from 1 to 1,024$"),
+    (["--threads=1000000"], r"threads = 1000000: needs a number from 1 to 1,024$"),
     (["--evaluation.every=-1"], r"evaluation\.every"),
     (["--evaluation.episodes=1"], r"evaluation\.episodes"),
     (["--output.latest_every=0"], r"output\.latest_every"),
@@ -98,7 +103,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.frozen=true", "--placement.policy=dblf", "--orientation.frozen=true",
       "--orientation.policy=random"], r"both agents are frozen"),
     (["--joint=true", "--placement.frozen=true", "--placement.policy=dblf"], r"cannot be frozen"),
-    (["--placement.teacher=dblf"], r"placement\.teacher_iterations = 0: needs 1 or more"),
+    (["--placement.teacher=dblf"], r"placement\.teacher_iterations = 0: needs a number from 1"),
     (["--placement.teacher_iterations=-1"], r"teacher_iterations = -1: goes with placement"),
     (["--placement.teacher_iterations=5"], r"= 5: goes with placement\.teacher"),
     (["--orientation.teacher=first", "--orientation.teacher_iterations=5",
@@ -112,7 +117,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
     (["--joint=true", "--game.mask_orientations=false"], r"mask_orientations.*always masked"),
     (["--ppo=null"], r"ppo"),
-    (["--seed=-1"], r"seed = -1: needs 0 or more"),
+    (["--seed=-1"], r"seed = -1: needs a number from 0 to 18,446,744,073,709,551,615$"),
     (["--output.name=.."], r"output\.name"),
 ])  # fmt: skip
 def test_a_mistake_is_named_with_what_would_be_right(options: list[str], expected: str) -> None:
@@ -126,11 +131,12 @@ def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main([f"--config={path}"]) == 2
     message = capsys.readouterr().err
     assert (
-        "unknown key placement.network.chanels. Did you mean placement.network.channels?" in message
+        "unknown key 'placement.network.chanels'; did you mean 'placement.network.channels'?"
+        in message
     )
     path.write_text("pppo:\n  gamma: 3\n")
     assert main([f"--config={path}"]) == 2
-    assert "unknown key pppo.gamma" in capsys.readouterr().err
+    assert "unknown key 'pppo.gamma'; did you mean 'ppo.gamma'?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("text", "expected"), [
@@ -173,3 +179,68 @@ def test_errors_of_the_game_and_of_agents_are_reported_as_plainly(
 ) -> None:
     assert main([*options, f"--output.folder={tmp_path}"]) == 2
     assert expected in capsys.readouterr().err
+
+
+def test_no_bad_settings_end_in_anything_but_one_line_or_in_what_they_say(tmp_path: Path) -> None:
+    path = tmp_path / "case.yaml"
+    for name, case in islice(cases(seed=1), 60):
+        options = case if isinstance(case, list) else [f"--config={path}"]
+        path.write_text(case if isinstance(case, str) else "", encoding="utf-8")
+        error = None
+        try:
+            config, _ = parse(options)
+        except ConfigError as refused:
+            error = str(refused)
+        if error is None:
+            assert from_dict(config.to_dict()) == config, name
+        else:
+            assert len(error.splitlines()) == 1, name
+
+
+def test_null_is_refused_for_every_key_that_needs_a_value_and_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, folder = tmp_path / "null.yaml", tmp_path / "runs"
+    null = {key for key, value in Config().flat().items() if value is None}
+    assert "game.margin" in null
+    for key in keys(make_parser()):
+        path.write_text(as_yaml(key, "null"))
+        if key in null:
+            assert parse([f"--config={path}"])[0] == Config()
+        else:
+            assert main([f"--config={path}", f"--output.folder={folder}"]) == 2, key
+            error = capsys.readouterr().err.strip()
+            assert re.match(rf"python -m marl_pack.train: {re.escape(key)} = null: needs ", error)
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    (LAUGHS, "settings need 10,000 values at most"),
+    ("game: &a {bin: *a}", "an anchor contains itself"),
+    ("seed: " + "[" * 100, "settings need 20 levels at most"),
+    ("seed: 1 # " + "x" * 100_000, "settings need 100,000 bytes at most"),
+    ("seed: '1'", "line 1: seed: needs a whole number, without quotes"),
+    ("config: x.yaml", "line 1: --config needs to be on the command line"),
+    ("? [a]\n: 1", "line 1: needs the name of a key"),
+    ("seed: " + "9" * 5000, "seed"),
+])  # fmt: skip
+def test_settings_beyond_all_need_are_refused_in_files_and_on_the_command_line(
+    text: str, expected: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "large.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        parse([f"--config={path}"])
+    with pytest.raises(ConfigError):
+        parse([f"--config={text}\n"])
+    with pytest.raises(ConfigError):
+        parse([f"--seed={text.partition(' ')[2]}x"])
+
+
+def test_a_run_that_needs_more_memory_than_there_is_says_so_and_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--ppo.num_envs=1000000", "--game.bin=[200,200,200]", f"--output.folder={tmp_path}"]
+    assert main(options) == 2
+    assert "too little memory for these settings" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

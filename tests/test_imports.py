@@ -9,7 +9,7 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "checks", "files", "inputs", "renamed"),
+    ("backend", "checks", "files", "inputs", "installation", "renamed", "terminal"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
     ("stability", "sapien_check"),
@@ -23,10 +23,10 @@ LAYERS = (
 
 # What the judge and the environment must not need.
 ONLY = {
-    "sapien_check": {"bins", "checks", "files", "geometry", "plan", "sapien_check"},
-    "env_aec": {"bins", "checks", "game", "geometry", "items", "plan", "render"},
-    "game": {"backend", "bins", "checks", "game", "geometry", "items", "plan", "renamed",
-             "stability"},
+    "sapien_check": {"bins", "checks", "files", "geometry", "installation", "plan", "sapien_check"},
+    "env_aec": {"bins", "checks", "game", "geometry", "installation", "items", "plan", "render"},
+    "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
+             "renamed", "stability"},
     "render": {"bins", "files", "geometry", "render"},
 }  # fmt: skip
 

@@ -199,7 +199,7 @@ def test_a_file_of_one_sequence_is_trained_on_and_options_are_not_abbreviated(
     assert main([*options, f"--output.folder={tmp_path}"]) == 0
     assert "over 1 episodes" in capsys.readouterr().out
     assert main(["--ppo.learning_rat=3"]) == 2
-    assert "unknown key ppo.learning_rat. Did you mean ppo.learning_rate?" in (
+    assert "unknown key 'ppo.learning_rat'; did you mean 'ppo.learning_rate'?" in (
         capsys.readouterr().err
     )
 

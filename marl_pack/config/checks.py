@@ -2,18 +2,71 @@
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
+from marl_pack.checks import shown
 from marl_pack.config.schema import Agent, Config
+from marl_pack.options import LARGEST_SEED, MOST_AT_ONCE
 
 
 class ConfigError(ValueError):
     """A setting is impossible; the message says what would be right."""
 
 
+class Range(NamedTuple):
+    """The numbers that a setting may be."""
+
+    low: float
+    high: float
+    open: bool = False  # whether low itself is too low
+
+    def __contains__(self, value: object) -> bool:
+        low_enough = self.low < value if self.open else self.low <= value  # type: ignore[operator]
+        return bool(low_enough and value <= self.high)  # type: ignore[operator]  # NaN is not in
+
+    def __str__(self) -> str:
+        if self.open:
+            return f"a positive number, {self.high:,} at most"
+        return f"a number from {self.low:,} to {self.high:,}"
+
+
+MANY, SEEDS, SHARE = Range(1, 10**9), Range(0, LARGEST_SEED), Range(0, 1)
+POSITIVE, NOT_NEGATIVE = Range(0, 10**6, open=True), Range(0, 10**6)
+RANGES = {
+    "seed": SEEDS,
+    "threads": Range(1, MOST_AT_ONCE),
+    "ppo.num_envs": Range(1, 10**6),
+    "ppo.num_steps_per_env": Range(1, 10**6),
+    "ppo.max_iterations": MANY,
+    "ppo.num_learning_epochs": Range(1, 10**6),
+    "ppo.num_mini_batches": MANY,
+    "ppo.gamma": SHARE,
+    "ppo.lam": SHARE,
+    "ppo.clip_param": POSITIVE,
+    "ppo.value_loss_coef": NOT_NEGATIVE,
+    "ppo.entropy_coef": NOT_NEGATIVE,
+    "ppo.final_entropy_coef": NOT_NEGATIVE,
+    "ppo.learning_rate": POSITIVE,
+    "ppo.desired_kl": POSITIVE,
+    "ppo.max_grad_norm": POSITIVE,
+    "evaluation.every": Range(0, 10**9),
+    "evaluation.episodes": Range(2, 10**7),
+    "evaluation.seed": SEEDS,
+    "output.latest_every": MANY,
+    "output.keep_every": MANY,
+    **{
+        f"{agent}.{key}": NOT_NEGATIVE
+        for agent in ("orientation", "placement")
+        for key in ("learning_rate", "entropy_coef", "final_entropy_coef")
+    },
+}
+"""The numbers that each setting may be; those of the game and of networks check themselves."""
+
+
 def refuse(key: str, value: object, right: str) -> None:
     """Raise ConfigError naming the key, its value and what would be right."""
-    raise ConfigError(f"{key} = {value}: {right}")
+    text = value if isinstance(value, str) and value.isidentifier() else shown(value)
+    raise ConfigError(f"{key} = {text}: {right}")
 
 
 def check(config: Config) -> None:
@@ -22,38 +75,23 @@ def check(config: Config) -> None:
     Raises:
         ConfigError: naming the key and what would be right.
     """
+    values = config.flat()
+    for key, allowed in RANGES.items():
+        if values[key] is not None and values[key] not in allowed:
+            refuse(key, values[key], f"needs {allowed}")
     check_ppo(config)
-    check_run(config)
+    check_output(config)
     check_agents(config)
 
 
 def check_ppo(config: Config) -> None:
-    """Refuse impossible settings of the updates."""
+    """Refuse impossible combinations of the updates' settings."""
     ppo = config.ppo
-    for key in ("num_envs", "num_steps_per_env", "max_iterations", "num_learning_epochs",
-                "num_mini_batches"):  # fmt: skip
-        if getattr(ppo, key) < 1:
-            refuse(f"ppo.{key}", getattr(ppo, key), "needs 1 or more")
     if 2 * ppo.num_mini_batches > ppo.num_envs * ppo.num_steps_per_env:
         refuse(
             "ppo.num_mini_batches", ppo.num_mini_batches,
             f"each needs 2 items, an iteration has only {ppo.num_envs * ppo.num_steps_per_env}",
         )  # fmt: skip
-    for key in ("gamma", "lam"):
-        if not 0 <= getattr(ppo, key) <= 1:
-            refuse(f"ppo.{key}", getattr(ppo, key), "needs a number from 0 to 1")
-    for key in ("learning_rate", "clip_param", "max_grad_norm", "desired_kl"):
-        value = getattr(ppo, key)
-        if not (math.isfinite(value) and value > 0):
-            refuse(f"ppo.{key}", value, "needs a positive number")
-    for section, values in (
-        ("ppo", (ppo.entropy_coef, ppo.final_entropy_coef, ppo.value_loss_coef)),
-        ("orientation", _own(config.orientation)),
-        ("placement", _own(config.placement)),
-    ):
-        for value in values:
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                refuse(section, value, "coefficients and rates need finite numbers, 0 or more")
     if ppo.symmetry and any(config.game.com_offset):
         refuse("ppo.symmetry", "true", "items whose centre of mass is off centre do not mirror")
     orientations = set(config.game.orientations)
@@ -61,23 +99,13 @@ def check_ppo(config: Config) -> None:
         refuse("ppo.symmetry", "true", "game.orientations needs the pairs 0 1, 2 3 and 4 5 whole")
 
 
-def check_run(config: Config) -> None:
-    """Refuse impossible settings of the process, the evaluation and the output."""
-    evaluation, output = config.evaluation, config.output
-    if config.threads < 1:
-        refuse("threads", config.threads, "needs 1 or more")
-    for key, value in (("seed", config.seed), ("evaluation.seed", evaluation.seed)):
-        if value < 0:
-            refuse(key, value, "needs 0 or more")
-    if evaluation.every < 0:
-        refuse("evaluation.every", evaluation.every, "needs 0 (never) or more")
-    if evaluation.episodes < 2:
-        refuse("evaluation.episodes", evaluation.episodes, "needs 2 or more")
-    for key in ("latest_every", "keep_every"):
-        if getattr(output, key) < 1:
-            refuse(f"output.{key}", getattr(output, key), "needs 1 or more")
-    if output.name in ("", ".", "..") or (output.name is not None and "/" in output.name):
-        refuse("output.name", repr(output.name), "needs the name of one folder")
+def check_output(config: Config) -> None:
+    """Refuse an impossible folder of the run."""
+    name, folder = config.output.name, config.output.folder
+    if name is not None and (name in ("", ".", "..") or "/" in name or not name.isprintable()):
+        refuse("output.name", name, "needs the name of one folder")
+    if not folder or "\0" in folder:
+        refuse("output.folder", folder, "needs the path of a folder")
 
 
 def check_agents(config: Config) -> None:
@@ -106,17 +134,13 @@ def check_teacher(name: str, agent: Agent, config: Config) -> None:
     iterations = agent.teacher_iterations
     if agent.teacher is None:
         if iterations != 0:
-            raise ConfigError(f"{duration} = {iterations}: goes with {name}.teacher")
+            refuse(duration, iterations, f"goes with {name}.teacher")
         return
-    if iterations < 1:
-        raise ConfigError(f"{duration} = {iterations}: needs 1 or more")
+    if iterations not in MANY:
+        refuse(duration, iterations, f"needs {MANY}")
     if agent.frozen:
         raise ConfigError(f"{key}: a frozen agent does not learn")
     if config.joint:
         raise ConfigError(f"{key}: the joint agent clones no teacher")
     if config.ppo.normalize_advantage_per_mini_batch:
         raise ConfigError(f"{key}: needs ppo.normalize_advantage_per_mini_batch: false")
-
-
-def _own(agent: Agent) -> tuple[float | None, ...]:
-    return agent.learning_rate, agent.entropy_coef, agent.final_entropy_coef

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import re
 import sys
-from collections.abc import Iterator, Sequence
+import types
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
 from marl_pack import renamed
+from marl_pack.checks import shown
 from marl_pack.config.checks import ConfigError, check
 from marl_pack.config.schema import Config
+
+MOST_BYTES = 100_000
+"""Largest file of settings."""
+DEEPEST = 20
+"""Most levels of lists and sections in settings, far more than there are."""
+MOST_NODES = 10_000
+"""Most values in settings, those counted that anchors repeat."""
 
 
 def make_parser() -> ArgumentParser:
@@ -50,53 +59,145 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
         ConfigError: for an unknown key, a wrong type or an impossible value.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    for before, option in pairwise(("", *words)):
-        path = option if before == "--config" else option.removeprefix("--config=")
-        if "\n" in path:  # the settings themselves, not a file's name
-            continue
-        if (before == "--config" or path != option) and Path(path).is_file():
-            check_file(Path(path))
     parser = make_parser()
+    for word in check_words(words, ["config", *sections()]):
+        check_source(word)
     with _explained(parser):
         options = parser.parse_args(words)
         return build(parser, options), options
 
 
-def check_file(path: Path) -> None:
-    """Refuse mistakes in a file that the parser would accept or report without their line.
+def sections() -> set[str]:
+    """Return the keys that have keys of their own."""
+    return {key.rpartition(".")[0] for key in TYPES} - {""}
+
+
+def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[str]:
+    """Check the values on a command line as YAML; yield those that may name or be a file.
+
+    Args:
+        words: of the command line.
+        files: options whose values may be files of settings.
+
+    Raises:
+        ConfigError: for a value that is too deep or too large.
+    """
+    for before, word in pairwise(("", *words)):
+        option, equals, value = word.partition("=")
+        option, value = (option, value) if equals and word[:2] == "--" else (before, word)
+        if option.removeprefix("--") in files:
+            yield value
+        else:
+            with contextlib.suppress(yaml.YAMLError):  # a text that is no YAML
+                compose(value, option)
+
+
+def check_source(source: str) -> None:
+    """Refuse mistakes in settings that the parser would accept or report without their line.
+
+    Args:
+        source: the path of a YAML file, or its text.
 
     Raises:
         ConfigError: for a file that is no YAML mapping, or has a key twice or an empty section.
     """
+    path = source
     try:
-        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        if "\n" in source or source.lstrip()[:1] == "{":
+            text, path = source, "settings"
+        elif "\0" in source or not Path(source).is_file():
+            raise ConfigError(f"{shown(source)}: there is no such file of settings")
+        elif Path(source).stat().st_size > MOST_BYTES:
+            raise ConfigError(f"{source}: settings need {MOST_BYTES:,} bytes at most")
+        else:
+            text = Path(source).read_text(encoding="utf-8")
+        root = compose(text, path)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text in UTF-8 ({error.reason})") from None
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(root, yaml.MappingNode):
         raise ConfigError(f"{path}: needs keys and values, as configs/rs.yaml has them")
-    sections = {key.rpartition(".")[0] for key in keys(make_parser())} - {""}
+    own = sections()
 
     def check_section(node: yaml.MappingNode, prefix: str) -> None:
         names = set()
         for name, value in node.value:
-            key, where = f"{prefix}{name.value}", f"{path}, line {name.start_mark.line + 1}"
+            where = f"{path}, line {name.start_mark.line + 1}"
+            if not isinstance(name, yaml.ScalarNode):
+                raise ConfigError(f"{where}: needs the name of a key")
+            key = f"{prefix}{name.value}"
             if key in names:
                 raise ConfigError(f"{where}: {key} is given twice")
             if key == "resume":
                 raise ConfigError(f"{where}: --resume needs to be on the command line")
+            if key == "config":
+                raise ConfigError(f"{where}: --config needs to be on the command line")
             names.add(key)
             if isinstance(value, yaml.MappingNode):
                 check_section(value, f"{key}.")
-            elif key in sections:
+            elif key in own:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
+            elif key in TYPES and str not in (TYPES[key], *get_args(TYPES[key])):
+                check_quotes(value, key, where)
+
+    def check_quotes(value: yaml.Node, key: str, where: str) -> None:
+        for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+            if getattr(node, "style", None) in ("'", '"') and WORDS.get(TYPES[key]) != WORDS[Any]:
+                raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without quotes")
 
     check_section(root, "")
 
 
+def compose(text: str, name: str) -> yaml.Node | None:
+    """Return the nodes of a YAML text of limited size, depth and repetition.
+
+    Raises:
+        ConfigError: beyond one of the limits; names the text.
+        yaml.YAMLError: if it is not YAML.
+    """
+    if len(text) > MOST_BYTES:
+        raise ConfigError(f"{name}: settings need {MOST_BYTES:,} characters at most")
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ConfigError(f"{name}: settings need {DEEPEST} levels at most")
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    counts: dict[int, int] = {}  # nodes below each node; 0 while they are counted
+
+    def children(node: yaml.Node) -> list[yaml.Node]:
+        if isinstance(node, yaml.MappingNode):
+            return [each for pair in node.value for each in pair]
+        return node.value if isinstance(node, yaml.SequenceNode) else []
+
+    def count(node: yaml.Node) -> int:
+        if id(node) not in counts:
+            counts[id(node)] = 0
+            below = [] if isinstance(node, yaml.ScalarNode) else node.value
+            parts = [
+                part for each in below for part in (each if isinstance(each, tuple) else [each])
+            ]
+            counts[id(node)] = 1 + sum(map(count, parts))
+        elif counts[id(node)] == 0:
+            raise ConfigError(f"{name}: an anchor contains itself")
+        if counts[id(node)] > MOST_NODES:
+            raise ConfigError(f"{name}: settings need {MOST_NODES:,} values at most")
+        return counts[id(node)]
+
+    if root is not None:
+        count(root)
+    return root
+
+
 def build(parser: ArgumentParser, options: Namespace) -> Config:
     """Return the checked :class:`Config` of parsed options."""
+    for key, kind in TYPES.items():
+        if options[key] is None and type(None) not in get_args(kind):
+            raise ConfigError(f"{key} = null: needs {in_words(key)}")
     built = parser.instantiate(options)
     config = Config(**{name: built[name] for name in Config.__dataclass_fields__})
     check(config)
@@ -123,8 +224,8 @@ def _explained(parser: ArgumentParser) -> Iterator[None]:
         raise
     except ArgumentError as error:
         raise ConfigError(explain(parser, str(error))) from None
-    except (ValueError, TypeError) as error:
-        raise ConfigError(str(error)) from None
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ConfigError(" ".join(str(error).split())) from None
 
 
 def keys(parser: ArgumentParser) -> list[str]:
@@ -134,32 +235,71 @@ def keys(parser: ArgumentParser) -> list[str]:
     ]
 
 
+def _types(owner: type, prefix: str = "") -> dict[str, Any]:
+    """Return the type of every key below a section."""
+    kinds: dict[str, Any] = {}
+    for name, kind in get_type_hints(owner).items():
+        key = prefix + name
+        kinds |= _types(kind, f"{key}.") if is_dataclass(kind) else {key: kind}  # type: ignore[arg-type]
+    return kinds
+
+
+TYPES = _types(Config)
+"""The type of every key."""
+WORDS = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
+    types.NoneType: "null", Any: "the name of a rule",
+}  # fmt: skip
+
+
+def in_words(key: str) -> str:
+    """Return what the value of a key needs to be, such as ``a number or null``."""
+    kind = TYPES[key]
+    if get_origin(kind) not in (list, tuple):
+        return _in_words(kind)
+    parts = [part for part in get_args(kind) if part is not Ellipsis]
+    number = f"{len(parts)} " if len(parts) > 1 else ""
+    example = ", ".join(map(str, Config().flat()[key]))
+    return f"a list of {number}{WORDS[parts[0]].removeprefix('a ')}s, such as [{example}]"
+
+
+def _in_words(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    if get_origin(kind) in (Union, types.UnionType):
+        return " or ".join(map(_in_words, get_args(kind)))
+    return WORDS[kind]
+
+
 def explain(parser: ArgumentParser, message: str) -> str:
-    """Return the parser's message, with the nearest and all valid keys where one is unknown."""
-    message = re.sub(r"\s*\n\s*", " ", message).strip()
-    message = re.sub(r"Expected a typing\.Literal\[(.*?)\]", r"Expected one of \1", message)
-    message = re.sub(r"Expected a <class '(\w+)'>", r"Expected \1", message)
-    inside = re.search(r"Group '([\w.]+)' does not accept option '([\w.]+)'", message)
-    beside = re.search(r"unrecognized arguments: --([\w.]+)", message)
+    """Return a message of the parser as what would be right, for an unknown key the valid ones."""
+    message = " ".join(message.split())
+    wrong = re.match(r'Parser key "([\w.]+)": ', message)
+    if wrong is not None and wrong[1] in TYPES:
+        value = re.search(r".*(?:Got|Given) value: (.*)$", message)
+        given = shown(value[1])[1:-1] if value else "a value"
+        return f"{wrong[1]} = {given}: needs {in_words(wrong[1])}"
+    inside = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
+    beside = re.search(r"[Uu]nrecognized arguments: (.*)", message)
+    alone = re.search(r"Option '([^']*)' is not accepted", message)
     if inside is not None:
         key = f"{inside[1]}.{inside[2]}"
-    elif beside is not None:
-        key = beside[1]
-    else:
-        alone = re.search(r"Option '([\w.]+)' is not accepted", message)
-        if alone is None:
-            return message
+    elif alone is not None:
         key = alone[1]
+    elif beside is not None and beside[1].startswith("--"):
+        key = re.split(r"[ =]", beside[1][2:])[0]
+    elif beside is not None:
+        return f"{beside[1]}: belongs to no key; a list is one word, such as --game.bin=[10,10,10]"
+    else:
+        return message
     section, _, last = key.rpartition(".")
     if last in renamed.AGENT_KEYS:
         return f"unknown key {key}: it is now called {section}.{renamed.AGENT_KEYS[last]}"
     every_key = keys(parser)
-    section = key.rpartition(".")[0]
     while section and not any(name.startswith(section + ".") for name in every_key):
         section = section.rpartition(".")[0]
     prefix = f"{section}." if section else ""
     valid = {n[len(prefix) :].partition(".")[0] for n in every_key if n.startswith(prefix)}
-    near = difflib.get_close_matches(key, every_key, 1)
-    guess = f" Did you mean {near[0]}?" if near else ""
+    guess = renamed.did_you_mean(renamed.nearest(key, every_key))
     where = f" in {section}" if section else ""
-    return f"unknown key {key}.{guess} Keys{where}: {', '.join(sorted(valid))}"
+    return f"unknown key {shown(key)}{guess} Keys{where}: {', '.join(sorted(valid))}"

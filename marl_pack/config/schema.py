@@ -190,6 +190,18 @@ class Config:
         plain: dict[str, Any] = _plain(asdict(self))
         return plain
 
+    def flat(self) -> dict[str, Any]:
+        """Return the plain value of every key, with dots between sections."""
+        return _flat(self.to_dict(), "")
+
+
+def _flat(settings: dict[str, Any], prefix: str) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, value in settings.items():
+        key = prefix + name
+        values |= _flat(value, f"{key}.") if isinstance(value, dict) else {key: value}
+    return values
+
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):

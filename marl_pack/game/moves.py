@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from marl_pack.backend import Backend
 from marl_pack.bins import Bins
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS, orientation_table
+from marl_pack.installation import njit
 from marl_pack.items import Items
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import OrientedItem, orient_item

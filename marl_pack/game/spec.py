@@ -8,7 +8,6 @@ it.
 from __future__ import annotations
 
 import argparse
-import difflib
 import inspect
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -240,8 +239,8 @@ class GameSpec:
         for name in options:
             renamed.refuse_old(name, renamed.OPTIONS, "option")
             if name not in names:
-                near = [taken[name]] if name in taken else difflib.get_close_matches(name, names, 1)
-                guess = f"; did you mean {near[0]!r}?" if near else "."
+                near = taken.get(name) or renamed.nearest(name, names)
+                guess = renamed.did_you_mean(near)
                 raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
         return replace(self, **options) if options else self
 

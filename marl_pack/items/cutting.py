@@ -6,12 +6,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.checks import shown, whole_number
 from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
+from marl_pack.installation import njit
 from marl_pack.items.random_numbers import draw, episode_keys
 
 

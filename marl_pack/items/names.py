@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
+
+from marl_pack import renamed
 
 SYNONYMS: dict[str, tuple[str, ...]] = {
     "amount": ("quantity",),
@@ -50,12 +51,11 @@ def check_names(
     if missing:
         problems.append(f"no {what} {', '.join(map(repr, missing))}")
     if unknown:
-        nearest = _nearest(unknown[0], [name for name in valid if name not in used])
-        hint = f"; did you mean {nearest!r}?" if nearest else ""
-        problems.append(f"unknown {what} {unknown[0]!r}{hint}")
+        near = _nearest(unknown[0], [name for name in valid if name not in used])
+        problems.append(f"unknown {what} {unknown[0]!r}{renamed.did_you_mean(near)}")
     if problems:
         text = "; ".join(problems)
-        end = "" if text.endswith("?") else "."
+        end = "" if unknown else "."
         raise ValueError(f"{source}: {text}{end} {what.capitalize()}s: {', '.join(valid)}")
 
 
@@ -63,4 +63,4 @@ def _nearest(name: str, free: Sequence[str]) -> str | None:
     """Return the name of ``free`` that ``name`` most probably means, or None."""
     plain = "_".join(name.lower().replace("-", " ").split())
     same = [other for other in (plain, *SYNONYMS.get(plain, ())) if other in free]
-    return next(iter(same + difflib.get_close_matches(plain, free, n=1)), None)
+    return same[0] if same else renamed.nearest(plain, free)

@@ -18,11 +18,11 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.backend import Backend, default_backend
 from marl_pack.geometry import Size
+from marl_pack.installation import njit
 from marl_pack.items.cutting import cut
 from marl_pack.items.items import ALL_ORIENTATIONS, Items, join
 from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mix

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,17 +18,12 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 from rich.table import Table
 
+from marl_pack.checks import whole_number
 from marl_pack.files import Growing, check_writable, write_json
+from marl_pack.options import LARGEST_SEED, MOST_AT_ONCE
 from marl_pack.physics import controls, table1
 from marl_pack.physics.options import add_body_options, chosen_bodies
 from marl_pack.plan_archive import load_plans, save_plans
@@ -38,15 +32,9 @@ from marl_pack.sapien_check.judge import Judged, Verdict, judge_all
 from marl_pack.sapien_check.stack import Stack
 from marl_pack.sapien_check.world import DEFAULT, Physics, SimulationError
 from marl_pack.stability import RULES
+from marl_pack.terminal import Parser, complain, make_console, make_progress
 
-
-def _progress(console: Console) -> Progress:
-    """Return a progress bar that is removed when the work is done."""
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(), console=console, transient=True,
-    )  # fmt: skip
-
+PROGRAM = "python -m marl_pack.sapien_check"
 
 # --- table1 ---------------------------------------------------------------------------------------
 
@@ -66,7 +54,7 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
     }  # fmt: skip
     growing = Growing(options.json, write_json)
     try:
-        with _progress(console) as bar:
+        with make_progress(console) as bar:
             for rule in rules:
                 for row in judged_rule(rule, options, bar):
                     rows[rule] = row
@@ -144,7 +132,7 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
 def run_controls(options: argparse.Namespace, console: Console) -> bool:
     """Judge the controls, print them, and return whether all were judged right."""
     cases = controls.cases()
-    with _progress(console) as bar:
+    with make_progress(console) as bar:
         task = bar.add_task("controls", total=len(cases))
         outcomes = []
         for name, margin, plan in cases:
@@ -225,7 +213,7 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     judged: dict[int, Judged] = {}
     growing = Growing(options.json, write_json)
     try:
-        with _progress(console) as bar:
+        with make_progress(console) as bar:
             task = bar.add_task("episodes", total=len(chosen))
             stacks = bodies.stacks(plans, chosen)
             verdicts = judge_all(stacks, options.physics, options.processes)
@@ -303,14 +291,14 @@ def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console
 # --- the command ----------------------------------------------------------------------------------
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command's options."""
-    options = argparse.ArgumentParser(
-        prog="python -m marl_pack.sapien_check",
+    options = Parser(
+        prog=PROGRAM,
         description="Judge stacks in physics (SAPIEN, on the CPU).",
     )
     commands = options.add_subparsers(dest="command", required=True)
-    shared = argparse.ArgumentParser(add_help=False)
+    shared = Parser(add_help=False)
     add = shared.add_argument
     add("--friction", type=float, default=DEFAULT.friction,
         help=f"between all faces (default: {DEFAULT.friction})")  # fmt: skip
@@ -318,7 +306,7 @@ def parser() -> argparse.ArgumentParser:
         help="let all boxes and the walls collide, as in a real bin: neighbours then prop up what "
              "would fall")  # fmt: skip
     add("--json", type=Path, metavar="FILE", help="write the figures there")
-    several = argparse.ArgumentParser(add_help=False)
+    several = Parser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     hint = f"that work at once (default: 1; here are {cores} cores)"
     several.add_argument("--processes", type=int, default=1, help=hint)
@@ -357,12 +345,10 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.sapien_check``; return its exit status."""
     options = parser().parse_args(arguments)
-    console = Console()
+    console = make_console()
     try:
-        if getattr(options, "processes", 1) < 1:
-            raise ValueError(f"--processes {options.processes}: needs 1 or more")
-        if getattr(options, "seed", 0) < 0:
-            raise ValueError(f"--seed {options.seed}: needs 0 or more")
+        for name, low, high in (("processes", 1, MOST_AT_ONCE), ("seed", 0, LARGEST_SEED)):
+            whole_number(getattr(options, name, low), f"--{name}", low, high)
         if options.json is not None:
             check_writable(options.json)
         options.physics = replace(
@@ -375,12 +361,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             run_stack(options, console)
     except SimulationError as error:
-        print(f"python -m marl_pack.sapien_check: no verdict: {error}", file=sys.stderr)
+        complain(PROGRAM, f"no verdict: {error}")
         return 1
     except KeyboardInterrupt:
-        print("python -m marl_pack.sapien_check: interrupted", file=sys.stderr)
+        complain(PROGRAM, "interrupted")
         return 130
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        print(f"python -m marl_pack.sapien_check: {error}", file=sys.stderr)
+        complain(PROGRAM, error)
         return 2
     return 0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from marl_pack.files import check_writable, moved_into_place
+from marl_pack.installation import missing
 from marl_pack.render.picture import PALETTE
 from marl_pack.sapien_check.stack import Floats, Stack
 from marl_pack.sapien_check.world import DEFAULT, Pass, Physics, World
@@ -25,9 +26,7 @@ try:
     import pyvista
     from vtkmodules.vtkCommonCore import vtkLogger
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"{error}: pictures need PyVista and imageio (pip install 'marl_pack[film]')"
-    ) from None
+    raise missing(error, "pictures need PyVista and imageio", "film") from None
 
 vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it warns of missing displays
 

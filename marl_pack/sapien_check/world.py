@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_pack.installation import missing
 from marl_pack.sapien_check.stack import Floats, Stack, overlaps
 
 GROUND_BIT = 31  # of the collision groups: the floor
@@ -73,9 +74,7 @@ def load_sapien() -> Any:
             warnings.simplefilter("ignore")  # about drivers for rendering, which is not done here
             import sapien
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{error}: the judge needs SAPIEN (pip install 'marl_pack[physics]')"
-        ) from None
+        raise missing(error, "the judge needs SAPIEN", "physics") from None
     return sapien
 
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.bins import Bins
+from marl_pack.installation import njit
 from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import Load
 from marl_pack.stability.oriented_item import OrientedItem

@@ -22,10 +22,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from torch import Tensor, from_numpy
 
 from marl_pack.geometry.compiled import mark_valid, slide
+from marl_pack.installation import njit
 from marl_pack.stability.centres import CentreTable
 from marl_pack.stability.hull_exact import OUTSIDE, UNDECIDED, UNSURE, YES, solve_undecided
 from marl_pack.stability.mask_runs import earlier_equals, in_bin, runs_of_footprints

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from marl_pack.installation import njit
 
 YES, UNDECIDED = 2, 1
 """Codes of a window: its centre of mass is inside the hull, or the exact test must decide. Every

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.bins import Bins
 from marl_pack.geometry.compiled import place_box
 from marl_pack.geometry.tensor import cut_windows, footprint, place_boxes
+from marl_pack.installation import njit
 from marl_pack.stability.hull_exact import envelope, row_extremes
 from marl_pack.stability.hull_tensor import PAIR_CELLS, boundary
 

@@ -28,10 +28,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from marl_pack.geometry.compiled import place_box
+from marl_pack.installation import njit
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 from marl_pack.stability.hull_exact import envelope, row_extremes
 from marl_pack.stability.simplex import NEAR, max_least_force

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from marl_pack.installation import njit
 
 NEAR = 1e-6
 """Least force, or least error of the equations, in mean weights, above which float64 decides."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.checks import real_number, shown, whole_number
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
+from marl_pack.installation import njit
 from marl_pack.stability.centres import exact
 
 Thresholds = tuple[tuple[float, int], ...]

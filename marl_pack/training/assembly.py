@@ -211,6 +211,10 @@ def make_runner(
             runner.begin_with(checkpoints.read(config.init, device))
     except (ValueError, FileNotFoundError) as error:
         raise ConfigError(str(error)) from None
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "memory" not in str(error):
+            raise
+        raise ConfigError(f"too little memory for these settings: {error}") from None
     return runner
 
 

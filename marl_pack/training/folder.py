@@ -202,7 +202,7 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
     config, options = parse(["--config", yaml.safe_dump(own.to_dict()), *arguments])
     if len(options.config or []) > 1:
         raise ConfigError("--resume: needs no --config, as the run has its own settings")
-    before, after = _flat(own.to_dict()), _flat(config.to_dict())
+    before, after = own.flat(), config.flat()
     for key, value in after.items():
         if value != before[key] and not key.startswith(MAY_CHANGE):
             raise ConfigError(
@@ -238,14 +238,3 @@ def _check_size(config: Config, checkpoint: Mapping[str, Any]) -> None:
     for state in states:
         if state.get("game", {}).get("t", torch.empty(0)).numel() != ppo.num_envs:
             raise ConfigError(f"--resume: ppo.num_envs = {ppo.num_envs}: the state has others")
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings in one dict with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from marl_pack.agents.afterstates import bitboards
@@ -28,6 +27,7 @@ from marl_pack.bins import Bins
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.geometry.compiled import place_box
 from marl_pack.geometry.tensor import footprint, place_boxes
+from marl_pack.installation import njit
 from marl_pack.stability import hull_compiled, hull_tensor
 
 MOST_LENGTHS = 5

@@ -13,7 +13,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, uint64
+from numba import uint64
+
+from marl_pack.installation import njit
 
 MOST_CELLS = 128
 """Number of bits of two words."""

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from rsl_rl.utils.logger import Logger
 
+from marl_pack.installation import missing
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -36,7 +38,7 @@ class IterationLogger(Logger):
             with contextlib.redirect_stdout(io.StringIO()):
                 super().init_logging_writer()
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(f"{error} (pip install 'marl_pack[wandb]')") from None
+            raise missing(error, "the logger wandb needs its package", "wandb") from None
 
     def log(
         self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float,

@@ -17,9 +17,10 @@ from marl_pack import renamed
 from marl_pack.agents.layers import initialized
 from marl_pack.agents.networks.planes import PLANES, Observation, channel_names, input_channels
 from marl_pack.checks import shown, whole_number
+from marl_pack.geometry import MAX_SIDE
 
-LARGEST = 2**15 - 1
-"""The largest number in a network's shape: the longest side of a bin."""
+MOST = {"channels": 4096, "layers": 128, "dilation": MAX_SIDE, "hidden": 65536}
+"""The largest value of each size of a network."""
 
 
 @dataclass
@@ -50,9 +51,9 @@ class Network:
     share_trunk: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("channels", "layers", "dilation", "hidden"):
+        for name, most in MOST.items():
             value = getattr(self, name)
-            whole_number(value, f"network: {name} = {shown(value)}", 1, LARGEST)
+            whole_number(value, f"network: {name} = {shown(value)}", 1, most)
         for name in ("residual", "shortcut", "context", "share_trunk"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"network: {name} = {shown(getattr(self, name))}: true or false")

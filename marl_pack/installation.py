@@ -1,0 +1,79 @@
+"""Settle what depends on the installation: the cache of compiled code, and optional packages."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of one function; a full or unreadable disk does not stop the program."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled function; None if it is not there or cannot be read."""
+        try:
+            return super().load_overload(sig, target_context)
+        except OSError as error:
+            _Uncached.warn(error)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Write the compiled function if that is possible."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _Uncached.warn(error)
+
+
+class _Uncached:
+    """The warning that compiled code is not cached, given once a process."""
+
+    given = False
+
+    @classmethod
+    def warn(cls, reason: Exception) -> None:
+        """Warn unless that was done before."""
+        if not cls.given:
+            cls.given = True
+            warnings.warn(
+                "compiled code cannot be cached, so each process compiles it again; set "
+                f"NUMBA_CACHE_DIR to a folder that may be written to ({reason})",
+                stacklevel=2,
+            )
+
+
+def njit(*, cache: bool = False, **options: Any) -> Callable[[Any], Any]:
+    """Return numba.njit's decorator, which compiles in memory where no cache can be written.
+
+    Args:
+        cache: whether the compiled code is cached on disk if that is possible.
+        **options: of ``numba.njit``.
+    """
+
+    def decorate(function: Any) -> Any:
+        compiled = numba.njit(**options)(function)
+        if cache and hasattr(compiled, "enable_caching"):  # not under NUMBA_DISABLE_JIT
+            try:
+                compiled._cache = _Cache(function)  # what enable_caching() does, with our class
+            except (RuntimeError, OSError) as error:
+                _Uncached.warn(error)
+        return compiled
+
+    return decorate
+
+
+def missing(error: ModuleNotFoundError, what: str, extra: str) -> ModuleNotFoundError:
+    """Return the error that an optional package is missing, with the command that installs it.
+
+    Args:
+        error: of the import.
+        what: names what needs the package, and the package.
+        extra: of ``pyproject.toml`` that has it.
+    """
+    return ModuleNotFoundError(
+        f"{error}: {what}; in the folder of marl_pack's source run pip install -e '.[{extra}]'"
+    )

@@ -1,0 +1,76 @@
+"""Print on the terminal: every program's output and errors, with foreign text made harmless.
+
+Names of policies, paths, texts of checkpoints and identifiers of items may hold anything. They are
+printed as they are: markup is not read, and characters that control a terminal show as escapes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import Any, NoReturn
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+LONGEST = 1000
+"""Number of characters of an error that are printed."""
+PIPED_WIDTH = 1000
+"""Columns of output that is not a terminal's, so that no table is cut."""
+
+
+def printable(text: str) -> str:
+    """Return a text whose characters can all be printed, the others as escapes."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def one_line(message: object) -> str:
+    """Return a message as one line of printable characters, of limited length."""
+    text = printable(" ".join(str(message).split()))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+class _PlainConsole(Console):
+    """A console that shows every text as it is."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return the text with printable characters only, without reading markup."""
+        return super().render_str(printable(text), **options)
+
+
+def make_console(**options: Any) -> Console:
+    """Return the console of a program; piped output is as wide as it needs to be."""
+    console = _PlainConsole(markup=False, emoji=False, **options)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = PIPED_WIDTH
+    return console
+
+
+def make_progress(console: Console) -> Progress:
+    """Return a progress bar that is removed when the work is done."""
+    return Progress(
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser of a command's options whose errors are one printable line."""
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """End the program with a status and a message."""
+        super().exit(status, None if message is None else f"{one_line(message)}\n")
+
+
+def complain(program: str, error: object) -> None:
+    """Print a program's error as one line."""
+    print(f"{program}: {one_line(error)}", file=sys.stderr)
