@@ -1,7 +1,7 @@
 """AgileRL: IPPO for both agents, on the environment's parallel view, turn by turn.
 
 Versions: agilerl 2.58, which needs pettingzoo < 1.27 and so an environment of its own:
-    pip install ".[agilerl]" && python examples/agilerl_ippo.py --items 1000000 --minutes 10
+    pip install -e ".[agilerl]" && python examples/agilerl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 37,888 items, utilization 52.3 → 72.5 %
 
 Traps:

@@ -1,7 +1,7 @@
 """BenchMARL: IPPO for both agents, through a task.
 
 Versions: benchmarl 1.5, which needs an older TorchRL, and so an environment of its own:
-    pip install ".[benchmarl]" && python examples/benchmarl_ippo.py --items 1000000 --minutes 10
+    pip install -e ".[benchmarl]" && python examples/benchmarl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 29,696 items, utilization 58.9 → 71.6 %
 
 Traps:

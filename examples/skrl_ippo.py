@@ -1,7 +1,7 @@
 """skrl: IPPO for both agents, on the environment's parallel view, turn by turn.
 
 Versions: skrl 2.1:
-    pip install ".[skrl]" && python examples/skrl_ippo.py --items 1000000 --minutes 10
+    pip install -e ".[skrl]" && python examples/skrl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 34,816 items, utilization 52.3 → 69.6 %
 
 Traps:

@@ -1,7 +1,7 @@
 """TorchRL: PPO for both agents, on the AEC environment as it is.
 
 Versions: torchrl 0.14, which needs tensordict < 0.15 and so an environment of its own:
-    pip install ".[torchrl]" && python examples/torchrl_ppo.py --items 1000000 --minutes 10
+    pip install -e ".[torchrl]" && python examples/torchrl_ppo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 25,600 items, utilization 58.9 → 69.7 %
 
 Traps:

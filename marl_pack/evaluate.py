@@ -23,7 +23,7 @@ from rich.table import Table
 from marl_pack.agents.policy import Policy
 from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
-from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
+from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
 from marl_pack.files import Growing, check_writable, write_json
 from marl_pack.options import EPILOG, MOST_AT_ONCE, Setup, add_options, choose, set_threads
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
@@ -45,15 +45,11 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
     for column in [*columns, "falls"] if physics else columns:
         table.add_column(column, justify="right", no_wrap=True)
     for name, row in rows.items():
-        spread = ("", "")
-        if row["interval"] is not None:
-            half = (row["interval"][1] - row["interval"][0]) / 2
-            spread = f" ± {100 * half:.2f}", f"{100 * row['std']:.2f}"
         table.add_row(
             name,
             str(row["episodes"]),
-            f"{100 * row['utilization']:.2f}{spread[0]}",
-            spread[1],
+            f"{100 * row['utilization']:.2f}{spread(row['utilization'], row['interval'])}",
+            "" if row["std"] is None else f"{100 * row['std']:.2f}",
             f"{row['packed']:.2f}",
             f"{row['decisions_per_second']:,.0f}",
             f"{100 * row['strict_equilibrium']:.2f}",
@@ -61,7 +57,8 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         )
     console.print(table)
     console.print(
-        "±: 95 % interval of the mean; dec./s: decisions (items placed) a second;\n"
+        f"±: 95 % interval of the mean, of {FEWEST} or more episodes;\n"
+        "dec./s: decisions (items placed) a second;\n"
         "in equilibrium: final stacks in strict equilibrium as a whole"
         + ("\nfalls: episodes in which something fell, in physics" if physics else "")
     )

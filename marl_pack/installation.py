@@ -75,5 +75,5 @@ def missing(error: ModuleNotFoundError, what: str, extra: str) -> ModuleNotFound
         extra: of ``pyproject.toml`` that has it.
     """
     return ModuleNotFoundError(
-        f"{error}: {what}; in the folder of marl_pack's source run pip install -e '.[{extra}]'"
+        f'{error}: {what}; run pip install -e ".[{extra}]" in marl_pack\'s source'
     )

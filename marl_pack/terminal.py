@@ -16,6 +16,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -55,10 +56,18 @@ def make_console(**options: Any) -> Console:
     return console
 
 
+class _Name(TextColumn):
+    """The name of a task, as it is."""
+
+    def render(self, task: Task) -> Text:
+        """Return the name with printable characters only."""
+        return Text(printable(task.description))
+
+
 def make_progress(console: Console) -> Progress:
     """Return a progress bar that is removed when the work is done."""
     return Progress(
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+        _Name(""), BarColumn(), MofNCompleteColumn(),
         TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True,
     )  # fmt: skip
 

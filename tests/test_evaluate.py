@@ -11,7 +11,7 @@ from marl_pack import play as play_command
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.evaluation import rollout
 from marl_pack.evaluation.rollout import Rollout
-from marl_pack.evaluation.statistics import strict_equilibrium, summary
+from marl_pack.evaluation.statistics import spread, strict_equilibrium, summary
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans
@@ -82,21 +82,30 @@ def filled(height: int, boxes: int) -> Plan:
 
 
 def test_the_summary_is_as_worked_by_hand() -> None:
-    played = Rollout([filled(5, 5), filled(6, 2), filled(7, 5)], seconds=3.0)
-    figures = summary(played, np.array([True, True, False]))
+    played = Rollout([filled(5, 5), filled(6, 2), filled(7, 5)] * 4, seconds=3.0)
+    figures = summary(played, np.array([True, True, False] * 4))
     assert figures["utilization"] == pytest.approx(0.6)
-    assert figures["std"] == pytest.approx(0.1)
-    # Student's t with two degrees of freedom: 4.3027 · 0.1 / √3
-    assert figures["interval"] == pytest.approx([0.6 - 0.24841, 0.6 + 0.24841], abs=1e-4)
+    assert figures["std"] == pytest.approx(0.1 * (8 / 11) ** 0.5)
+    # Student's t with eleven degrees of freedom: 2.20099 · 0.08528 / √12
+    assert figures["interval"] == pytest.approx([0.6 - 0.054185, 0.6 + 0.054185], abs=1e-5)
     assert figures["packed"] == pytest.approx(4)
-    assert figures["decisions_per_second"] == pytest.approx(4)
+    assert figures["decisions_per_second"] == pytest.approx(16)
     assert figures["strict_equilibrium"] == pytest.approx(2 / 3)
 
 
 def test_equal_episodes_have_an_interval_of_no_width() -> None:
-    figures = summary(Rollout([filled(3, 2)] * 3, 1.0), np.ones(3, np.bool_))
+    figures = summary(Rollout([filled(3, 2)] * 10, 1.0), np.ones(10, np.bool_))
     assert figures["interval"] == [0.3, 0.3]
     assert figures["std"] == 0
+
+
+def test_intervals_need_ten_episodes_and_lie_within_the_bin() -> None:
+    plans = [*[filled(1, 1)] * 9, filled(10, 2)]
+    assert summary(Rollout(plans[1:], 1.0), np.ones(9, np.bool_))["interval"] is None
+    figures = summary(Rollout(plans, 1.0), np.ones(10, np.bool_))
+    # Student's t with nine degrees of freedom: 0.19 ± 2.26216 · 0.28460 / √10
+    assert figures["interval"] == pytest.approx([0, 0.39359], abs=1e-5)
+    assert spread(figures["utilization"], figures["interval"]) == " ± 20.36"
 
 
 def test_a_stack_that_falls_is_not_in_equilibrium() -> None:

@@ -192,4 +192,4 @@ def test_every_example_is_run_and_can_be_installed() -> None:
         if extra == "cleanrl":  # needs nothing
             continue
         assert extra in extras
-        assert f'pip install ".[{extra}]" && python examples/{file}.py' in head
+        assert f'pip install -e ".[{extra}]" && python examples/{file}.py' in head

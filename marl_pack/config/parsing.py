@@ -22,6 +22,8 @@ from marl_pack.config.schema import Config
 
 MOST_BYTES = 100_000
 """Largest file of settings."""
+LONGEST_VALUE = 4096
+"""Most characters of one value, as of a path."""
 DEEPEST = 20
 """Most levels of lists and sections in settings, far more than there are."""
 MOST_NODES = 10_000
@@ -60,8 +62,8 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
     """
     words = sys.argv[1:] if arguments is None else arguments
     parser = make_parser()
-    for word in check_words(words, ["config", *sections()]):
-        check_source(word)
+    for option, source in check_words(words, ["config", *sections()]):
+        check_source(source, option)
     with _explained(parser):
         options = parser.parse_args(words)
         return build(parser, options), options
@@ -72,8 +74,8 @@ def sections() -> set[str]:
     return {key.rpartition(".")[0] for key in TYPES} - {""}
 
 
-def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[str]:
-    """Check the values on a command line as YAML; yield those that may name or be a file.
+def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Check the values on a command line as YAML; yield the options whose values may be files.
 
     Args:
         words: of the command line.
@@ -86,17 +88,18 @@ def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[str]:
         option, equals, value = word.partition("=")
         option, value = (option, value) if equals and word[:2] == "--" else (before, word)
         if option.removeprefix("--") in files:
-            yield value
+            yield option, value
         else:
             with contextlib.suppress(yaml.YAMLError):  # a text that is no YAML
                 compose(value, option)
 
 
-def check_source(source: str) -> None:
+def check_source(source: str, option: str) -> None:
     """Refuse mistakes in settings that the parser would accept or report without their line.
 
     Args:
         source: the path of a YAML file, or its text.
+        option: of the command line that names it.
 
     Raises:
         ConfigError: for a file that is no YAML mapping, or has a key twice or an empty section.
@@ -104,9 +107,9 @@ def check_source(source: str) -> None:
     path = source
     try:
         if "\n" in source or source.lstrip()[:1] == "{":
-            text, path = source, "settings"
+            text, path = source, option
         elif "\0" in source or not Path(source).is_file():
-            raise ConfigError(f"{shown(source)}: there is no such file of settings")
+            raise ConfigError(f"{option} {shown(source)}: there is no such file of settings")
         elif Path(source).stat().st_size > MOST_BYTES:
             raise ConfigError(f"{source}: settings need {MOST_BYTES:,} bytes at most")
         else:
@@ -164,6 +167,8 @@ def compose(text: str, name: str) -> yaml.Node | None:
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_VALUE:
+            raise ConfigError(f"{name}: a value needs {LONGEST_VALUE:,} characters at most")
         if depth > DEEPEST:
             raise ConfigError(f"{name}: settings need {DEEPEST} levels at most")
     root = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -278,7 +283,7 @@ def explain(parser: ArgumentParser, message: str) -> str:
     if wrong is not None and wrong[1] in TYPES:
         value = re.search(r".*(?:Got|Given) value: (.*)$", message)
         given = shown(value[1])[1:-1] if value else "a value"
-        return f"{wrong[1]} = {given}: needs {in_words(wrong[1])}"
+        return f"{wrong[1]} = {'null' if given == 'None' else given}: needs {in_words(wrong[1])}"
     inside = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
     beside = re.search(r"[Uu]nrecognized arguments: (.*)", message)
     alone = re.search(r"Option '([^']*)' is not accepted", message)

@@ -14,6 +14,9 @@ from marl_pack.plan import Plan
 from marl_pack.sapien_check.judge import Judged
 from marl_pack.stability import in_equilibrium
 
+FEWEST = 10
+"""Number of episodes from which a mean has an interval: with fewer, Student's says nothing."""
+
 
 def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
     """Compute the 95 % interval of the mean (Student's t); None for a single value."""
@@ -29,10 +32,13 @@ def mean_utilization(rollout: Rollout) -> dict[str, Any]:
     """Compute mean utilization with its 95 % interval over episodes, and items packed.
 
     Keys ``episodes``, ``utilization``, ``low``, ``high``, ``std``, ``packed``; shares of the bin's
-    volume. A single episode has no interval and no standard deviation (None).
+    volume. The interval is Student's, cut to the shares from 0 to 1, in which every mean lies.
+    Fewer than :data:`FEWEST` episodes have no interval, and one no standard deviation (None).
     """
     utilization = rollout.utilization
-    low, high = interval(utilization) or (None, None)
+    low, high = None, None
+    if len(utilization) >= FEWEST:
+        low, high = np.clip(interval(utilization) or (0, 1), 0, 1).tolist()
     return {
         "episodes": len(utilization),
         "utilization": float(utilization.mean()),
@@ -41,6 +47,16 @@ def mean_utilization(rollout: Rollout) -> dict[str, Any]:
         "std": float(utilization.std(ddof=1)) if len(utilization) > 1 else None,
         "packed": float(rollout.packed.mean()),
     }
+
+
+def spread(mean: float, bounds: Sequence[float] | None) -> str:
+    """Return an interval of a share as text in per cent, such as `` ± 0.52``; empty if None.
+
+    It is the distance to the farther bound where the interval is cut at 0 or 1.
+    """
+    if bounds is None:
+        return ""
+    return f" ± {100 * max(mean - bounds[0], bounds[1] - mean):.2f}"
 
 
 def summary(rollout: Rollout, balanced: NDArray[np.bool_]) -> dict[str, Any]:

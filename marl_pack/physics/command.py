@@ -283,7 +283,7 @@ def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console
     """Write the picture or film of one stack."""
     from marl_pack.physics import film  # needs a renderer, which nothing else does
 
-    frame = film.render(stack, options.render, f"{title}: {len(stack)} boxes", options.physics)
+    frame = film.render(stack, options.render, title, options.physics)
     state = f"box {', '.join(map(str, frame.moved))} moved" if frame.moved else "nothing moved"
     console.print(f"{options.render}: all boxes and walls collide; {state}", soft_wrap=True)
 

@@ -80,7 +80,7 @@ class View:
 
     Args:
         stack: all boxes that will be shown.
-        title: written above.
+        title: written above, with the number of boxes placed so far.
     """
 
     def __init__(self, stack: Stack, title: str = "") -> None:
@@ -92,9 +92,8 @@ class View:
         self.plotter.add_mesh(outline, style="wireframe", color="#707070", line_width=2)
         floor = pyvista.Box((0, w, 0, d, -0.01 * h, 0))
         self.plotter.add_mesh(floor, color="#e8e8e8")
+        self.title = title
         self.boxes = [self._add(stack, i) for i in range(len(stack))]
-        if title:
-            self.plotter.add_text(title, font_size=9, color="black")
         self.plotter.view_vector((1.0, -1.4, 0.9), viewup=(0, 0, 1))
         self.plotter.camera.zoom(0.95)
 
@@ -122,6 +121,9 @@ class View:
                     actor.user_matrix = _matrix(frame.middles[i], frame.rotations[i])
             if i in frame.moved:
                 actors[0].prop.color = FALLEN
+        if self.title:
+            caption = caption_of(self.title, len(frame.middles), len(self.boxes))
+            self.plotter.add_text(caption, font_size=9, color="black", name="caption")
         self.plotter.render()
         image: NDArray[np.uint8] = self.plotter.screenshot(return_img=True)
         return image
@@ -129,6 +131,11 @@ class View:
     def close(self) -> None:
         """Free the memory of the plotter."""
         self.plotter.close()
+
+
+def caption_of(title: str, placed: int, boxes: int) -> str:
+    """Return the text above one moment of a film."""
+    return f"{title}: {placed} of {boxes} boxes"
 
 
 def _matrix(middle: Floats, rotation: Floats) -> Floats:

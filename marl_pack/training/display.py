@@ -15,6 +15,7 @@ from rich.progress import Progress as Bar
 from rich.text import Text
 
 from marl_pack.agents.learning.logging import Progress
+from marl_pack.evaluation.statistics import spread
 
 QUIET_SECONDS = 30.0  # between lines of progress where the output is not a terminal
 
@@ -66,10 +67,11 @@ class Display:
 
     def evaluated(self, row: Mapping[str, Any]) -> None:
         """Show the result of one evaluation."""
-        spread = "" if row["low"] is None else f" ± {50 * (row['high'] - row['low']):.2f}"
+        bounds = None if row["low"] is None else (row["low"], row["high"])
         self.console.print(
             f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "
-            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f}{spread} "
+            f"{row['seconds'] / 60:.1f} min: utilization {100 * row['utilization']:.2f}"
+            f"{spread(row['utilization'], bounds)} "
             f"% over {row['episodes']} episodes",
             soft_wrap=True,
         )

@@ -6,6 +6,7 @@ it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
@@ -22,6 +23,14 @@ ILLEGAL = -1e6
 """Value of an illegal placement, less than that of any legal one."""
 AT_ONCE = 1 << 15
 """Largest number of afterstates that the critic values at once."""
+
+MANY_CELLS = 1000
+"""Cells of a floor above which a decision takes more than about a second on a CPU."""
+SLOW = (
+    "seconds a decision on a floor of {width} x {depth} cells: the time of afterstates grows with "
+    "the square of the cells; use larger cells, or a policy that needs none (not max_feasible, no "
+    "planes feasible_cells, feasible_probability, afterstate_value)"
+)
 
 
 class Memo:
@@ -80,6 +89,9 @@ class Lookahead:
         """Compute the afterstate of each legal placement."""
 
         def compute() -> Afterstates:
+            width, depth, _ = game.size
+            if width * depth > MANY_CELLS and game.device.type == "cpu":
+                warnings.warn(SLOW.format(width=width, depth=depth), stacklevel=2)
             sides = game.orient_item(game.items).sides
             return afterstates_of(game.bins, sides, game.mask, probe_lengths(*game.stream.sides))
 
