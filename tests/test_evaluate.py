@@ -94,8 +94,8 @@ def test_the_summary_is_as_worked_by_hand() -> None:
 
 
 def test_equal_episodes_have_an_interval_of_no_width() -> None:
-    figures = summary(Rollout([filled(3, 2)] * 10, 1.0), np.ones(10, np.bool_))
-    assert figures["interval"] == [0.3, 0.3]
+    figures = summary(Rollout([filled(5, 2)] * 10, 1.0), np.ones(10, np.bool_))
+    assert figures["interval"] == [0.5, 0.5]
     assert figures["std"] == 0
 
 
@@ -171,7 +171,10 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--json tests", "is a folder"),
         ("--device nowhere", "device 'nowhere'"),
         ("--device meta", "needs cpu, cuda"),
-        ("--seed -1", "needs 0 or more"),
+        ("--seed -1", "--seed: needs a whole number from 0 to 18446744073709551615, not -1"),
+        ("--threads 0", "--threads: needs a whole number from 1 to 1024, not 0"),
+        ("--threads 1000000", "from 1 to 1024, not 1000000"),
+        ("--processes 1000000", "--processes: needs a whole number from 1 to 1024"),
     ],
 )
 def test_impossible_options_are_refused_without_a_traceback(

@@ -218,3 +218,10 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         results.append(maps(afterstates_of(*arguments_of(game)), game))
     for alone, shared in zip(*results, strict=True):
         assert torch.equal(alone, shared)
+
+
+def test_a_floor_of_many_cells_is_warned_of_with_the_reason() -> None:
+    game = Packing(1, (40, 30, 4), sides=(4, 4), rule="none")
+    game.mask[:, :, 3:] = False  # few placements, so that it is fast here
+    with pytest.warns(UserWarning, match=r"floor of 40 x 30 cells: the time of .* larger cells"):
+        Lookahead().afterstates(game)

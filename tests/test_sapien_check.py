@@ -356,8 +356,9 @@ def test_saved_stacks_are_judged_and_drawn(
 @pytest.mark.parametrize(("arguments", "why"), [
     ("stack nowhere.npz", "nowhere.npz"),
     ("table1 --objects 0", "--objects 0"),
-    ("table1 --processes 0", "--processes 0"),
-    ("table1 --seed -1", "--seed -1"),
+    ("table1 --processes 0", "--processes: needs a whole number from 1 to 1024, not 0"),
+    ("table1 --processes 1000000", "from 1 to 1024, not 1000000"),
+    ("table1 --seed -1", "--seed: needs a whole number from 0 to"),
     ("controls --friction nan", "friction = nan"),
     ("table1 --json nowhere/x.json", "does not exist"),
 ])  # fmt: skip
@@ -403,6 +404,8 @@ def test_a_film_shows_the_fall(tmp_path: Path) -> None:
     assert frames[-1].middles[2, 2] == pytest.approx(0.05, abs=0.01)  # the heavy one is down
     path = tmp_path / "fall.gif"
     assert film.render(pile, path, "falls").moved
+    captions = [film.caption_of("falls", len(f.middles), 3) for f in (frames[0], frames[-1])]
+    assert captions == ["falls: 1 of 3 boxes", "falls: 3 of 3 boxes"]
     pictures = imageio.mimread(path)
     falling = sum(
         len(a.middles) == len(b.middles) and np.abs(b.middles - a.middles).max() > 0.002
