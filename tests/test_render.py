@@ -213,3 +213,9 @@ def test_a_saved_picture_reads_back_as_it_was(tmp_path):
 def test_impossible_arguments_are_refused_with_what_would_be_right(change, words):
     with pytest.raises(ValueError, match=words):
         draw(**{"size": SIZE, "boxes": EMPTY} | change)
+
+
+def test_a_title_is_drawn_as_it_is() -> None:
+    boxes = np.zeros((0, 6), int)
+    plain, titled = (draw((4, 4, 4), boxes, title=t) for t in ("", "runs/$a_$ plays"))
+    assert np.any(plain != titled)
