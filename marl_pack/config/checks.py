@@ -31,7 +31,7 @@ class Range(NamedTuple):
 
 
 MANY, SEEDS, SHARE = Range(1, 10**9), Range(0, LARGEST_SEED), Range(0, 1)
-POSITIVE, NOT_NEGATIVE = Range(0, 10**6, open=True), Range(0, 10**6)
+POSITIVE, NOT_NEGATIVE = Range(0, 1e38, open=True), Range(0, 1e38)
 RANGES = {
     "seed": SEEDS,
     "threads": Range(1, MOST_AT_ONCE),
