@@ -24,6 +24,7 @@ from marl_pack.agents.policy import (
     draw,
     in_turns,
 )
+from marl_pack.checks import shown
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import resting_heights_and_waste
@@ -173,10 +174,10 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     Raises:
         ValueError: for an unknown name.
     """
+    if not isinstance(name, str) or name not in POLICIES:
+        raise _unknown("policy", name, POLICIES)
     if name in HEURISTICS:
         return HEURISTICS[name]
-    if name != "random":
-        raise _unknown("policy", name, POLICIES)
     generator = _generator(seed, device)
     return in_turns(
         lambda game: draw(game.orientation_mask, generator),
@@ -233,9 +234,9 @@ def make_placement_agent(
 
 
 def _unknown(kind: str, name: str, names: Sequence[str]) -> ValueError:
-    if name in renamed.POLICIES:
+    if isinstance(name, str) and name in renamed.POLICIES:
         return ValueError(f"{kind} {name!r} is now called {renamed.POLICIES[name]!r}")
-    return ValueError(f"unknown {kind} {name!r}: one of {', '.join(names)}")
+    return ValueError(f"unknown {kind} {shown(name)}: one of {', '.join(names)}")
 
 
 def _generator(seed: int | None, device: torch.device | str) -> torch.Generator | None:

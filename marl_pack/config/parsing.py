@@ -217,7 +217,10 @@ def from_dict(settings: dict[str, Any]) -> Config:
     """
     parser = make_parser()
     with _explained(parser):
-        return build(parser, parser.parse_object(settings))
+        try:
+            return build(parser, parser.parse_object(settings))
+        except KeyError as error:  # a section is no mapping
+            raise ConfigError(f"settings: {error.args[0]}") from None
 
 
 @contextlib.contextmanager

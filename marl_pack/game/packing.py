@@ -36,6 +36,8 @@ from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
 
+MOST_GAMES = 1 << 20
+"""The most games that are played at once."""
 MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
 LAST_EPISODE = 2**62
@@ -108,7 +110,7 @@ class Packing:
             raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
         options |= {} if bin is None else {"bin": bin}
         self.spec = (spec or GameSpec()).with_options(options)
-        self.n = n = whole_number(n, "n, at least one game", 1)
+        self.n = n = whole_number(n, "n, at least one game", 1, MOST_GAMES)
         self.auto_reset = bool(auto_reset)
         self.checked = invariants.wanted()
         self.device = check_device(device)
@@ -269,7 +271,7 @@ class Packing:
             ValueError: naming the first game and tensor that are wrong.
         """
         again, count = self._alias(), state.bins.count
-        again.auto_reset = False
+        again.auto_reset = again.checked = False
         beyond = (state.episode < -LAST_EPISODE) | (state.episode > LAST_EPISODE)
         refuse_where(beyond, "episode", "the number of an episode")
         again._start(state.episode.clone(), state.bins.boxes.shape[1])

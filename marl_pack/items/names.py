@@ -61,6 +61,6 @@ def check_names(
 
 def _nearest(name: str, free: Sequence[str]) -> str | None:
     """Return the name of ``free`` that ``name`` most probably means, or None."""
-    plain = "_".join(name.lower().replace("-", " ").split())
+    plain = "_".join(str(name).lower().replace("-", " ").split())
     same = [other for other in (plain, *SYNONYMS.get(plain, ())) if other in free]
     return same[0] if same else renamed.nearest(plain, free)

@@ -144,7 +144,7 @@ def _bind(
     if isinstance(rule, str):
         bound = make_rule(rule, **parameters)
     elif not callable(rule):
-        raise ValueError(f"rule {rule!r}: needs a name in RULES or a rule from make_rule")
+        raise ValueError(f"rule {shown(rule)}: needs a name in RULES or a rule from make_rule")
     elif parameters:
         raise ValueError(f"{sorted(parameters)}: need the name of a rule, not a bound one")
     else:

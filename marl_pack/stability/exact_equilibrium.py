@@ -60,7 +60,10 @@ def stands_exactly(loads: Sequence[Load], forces: Iterable[Force]) -> bool:
         loads: of the boxes.
         forces: that may act between them and the ground.
     """
-    a, weights = _equations(loads, list(forces))
+    columns = list(forces)
+    if not columns:
+        return False
+    a, weights = _equations(loads, columns)
     try:
         rounded = a.astype(np.float64)
         total = float(weights.sum())

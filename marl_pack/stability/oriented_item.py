@@ -9,7 +9,7 @@ from fractions import Fraction
 from torch import Tensor
 
 from marl_pack.bins import Bins
-from marl_pack.checks import real_number
+from marl_pack.checks import real_number, shown
 from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.stability.centres import HALF, CentreTable, Offsets, centre_table, exact
 
@@ -59,10 +59,13 @@ def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
     Raises:
         ValueError: unless there are three numbers, each strictly between -0.5 and 0.5.
     """
-    values = tuple(real_number(f, "com_offset") for f in offset)
+    try:
+        values = tuple(real_number(f, "com_offset") for f in offset)
+    except TypeError:  # not a sequence
+        values = ()
     if len(values) != 3 or not all(-0.5 < f < 0.5 for f in values):
         raise ValueError(
-            f"com_offset {offset!r}: needs three fractions of the item's own sides w, d, h, "
+            f"com_offset {shown(offset)}: needs three fractions of the item's own sides w, d, h, "
             "each strictly between -0.5 and 0.5 (0 is the geometric centre)"
         )
     return values[0], values[1], values[2]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.bins import Bins
-from marl_pack.checks import real_number
+from marl_pack.checks import real_number, shown
 from marl_pack.geometry import MAX_SIDE
 from marl_pack.stability import hull_compiled, hull_tensor, reference, support_area
 from marl_pack.stability.equilibrium_masks import equilibrium_mask
@@ -128,8 +128,8 @@ def make_rule(name: str, **parameters: object) -> Rule:
     Raises:
         ValueError: for an unknown rule, an unknown parameter or a negative margin.
     """
-    if name not in RULES:
-        raise ValueError(f"unknown stability rule {name!r}: one of {', '.join(RULES)}")
+    if not isinstance(name, str) or name not in RULES:
+        raise ValueError(f"unknown stability rule {shown(name)}: one of {', '.join(RULES)}")
     accepted = list(inspect.signature(RULES[name]).parameters)[2:]
     for key in parameters:
         if key not in accepted:
@@ -138,7 +138,7 @@ def make_rule(name: str, **parameters: object) -> Rule:
     if not 0 <= margin <= MAX_SIDE:
         raise ValueError(f"margin {margin!r}: needs a number of cells from 0 to {MAX_SIDE}")
     if not isinstance(parameters.get("check_stack", False), bool):
-        raise ValueError(f"check_stack {parameters['check_stack']!r}: needs true or false")
+        raise ValueError(f"check_stack {shown(parameters['check_stack'])}: needs true or false")
     if name == "area_ratio":
         thresholds: Any = parameters.get("thresholds", "paper")
         parameters["thresholds"] = support_area.check_thresholds(thresholds)

@@ -21,6 +21,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from marl_pack.checks import shown
 from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 
@@ -186,7 +187,13 @@ def _check_loads(loads: ArrayLike, n: int) -> NDArray[np.float64]:
     Raises:
         ValueError: unless there is a finite row for each of n boxes, with a positive weight.
     """
-    rows = np.asarray(loads, np.float64)
+    try:
+        rows = np.asarray(loads)
+    except ValueError:  # rows of different lengths
+        rows = np.empty(0, object)
+    if rows.dtype.kind not in "iuf" or np.ma.is_masked(loads):
+        raise ValueError(f"loads: need rows weight, x, y of numbers, not {shown(loads)}")
+    rows = rows.astype(np.float64)
     if rows.shape != (n, 3) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
         raise ValueError(f"loads: need rows weight > 0, x, y of finite numbers, [{n}, 3]")
     return rows

@@ -120,8 +120,8 @@ def _claimed(folder: Path) -> Iterator[None]:
         remove_unfinished(folder)
         yield
     finally:
-        with contextlib.suppress(OSError):  # it is gone, or another process begins a run there
-            if os.listdir(folder) == [LOCK]:
+        with contextlib.suppress(OSError):  # it is gone, or holds other files
+            if not (folder / SETTINGS).exists():
                 (folder / LOCK).unlink()
                 folder.rmdir()
         lock.release()

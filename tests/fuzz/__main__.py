@@ -1,0 +1,7 @@
+"""Run ``python -m tests.fuzz``: see :mod:`tests.fuzz.program`."""
+
+import sys
+
+from .program import main
+
+sys.exit(main())
