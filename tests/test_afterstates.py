@@ -176,6 +176,24 @@ def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
         learner.learn(rewards, rewards, 1e-3)
 
 
+def test_the_critic_learns_at_the_first_learners_learning_rate() -> None:
+    runner = small_runner(
+        None, *BOTH_SEE_VALUES, "--ppo.learning_rate=2e-3", "--placement.learning_rate=7e-3",
+        "--ppo.max_iterations=10",
+    )  # fmt: skip
+    alg = runner.alg
+    optimizer = alg.afterstates.optimizer
+    runner.train(1)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(2e-3)
+    runner.train(6)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(2e-3 * 0.5)
+    game, before = Packing(8, seed=1), copies(alg.afterstates.critic)
+    learner = AfterstateLearner(alg.afterstates.critic, Lookahead(), 1, 8)
+    learner.record(game, *make_policy("dblf")(game))
+    learner.learn(torch.ones(1, 8, 1), torch.zeros(1, 8, 1), 0.0)
+    assert same(before, alg.afterstates.critic.state_dict())
+
+
 def test_a_choice_without_a_legal_cell_is_not_learned_from() -> None:
     game = Packing(16, (4, 4, 4), sides=(1, 4), seed=2, mask_orientations=False)
     critic = AfterstateCritic()

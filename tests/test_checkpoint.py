@@ -1,5 +1,6 @@
 """Checkpoints rebuild their policies, and other files are refused."""
 
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from marl_pack.agents.search import SearchSettings
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
+from marl_pack.options import with_search
 from marl_pack.train import main as train
 
 
@@ -134,6 +136,19 @@ def test_a_depth_needs_a_critic_that_estimates_shares_of_the_bin(runs: Path) -> 
         with pytest.raises(ValueError, match="a depth needs agents trained with"):
             Loader().planner(checkpoint | {"config": other}, depth, futures)
         Loader().planner(checkpoint | {"config": other}, SearchSettings(), futures)
+
+
+def test_a_search_imagines_items_of_the_training_and_not_those_that_are_evaluated(
+    runs: Path,
+) -> None:
+    source = str(runs / "both")
+    arguments = Namespace(
+        plan="rollouts=1", orientation=None, device="cpu", seed=0, symmetric=False
+    )
+    evaluated = make_stream([[1, 1, 1], [9, 9, 9]], (10, 10, 10))
+    policies = {source: Loader().policy(source)}
+    (planner,) = with_search(policies, arguments, evaluated, (10, 10, 10)).values()
+    assert planner.futures == make_stream("rs", (10, 10, 10), (2, 5))
 
 
 def test_a_frozen_agent_that_plays_at_random_has_the_seed_of_the_evaluation(runs: Path) -> None:

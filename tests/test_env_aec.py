@@ -295,6 +295,15 @@ def test_both_agents_are_truncated_after_max_cycles() -> None:
     assert env.terminations == {O: False, P: False}
 
 
+def test_an_episode_that_ends_in_its_last_cycle_is_not_truncated_as_well() -> None:
+    env = env_aec.raw_env(items=[[2, 2, 2], [3, 3, 3]], max_cycles=2)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(int(np.flatnonzero(mask_of(env, env.agent_selection))[0]))
+    assert env.terminations == {O: True, P: True}
+    assert env.truncations == {O: False, P: False}
+
+
 def test_a_given_sequence_is_played_once() -> None:
     env = env_aec.env(items="rs")
     env.reset(seed=1, options={"items": np.array([[2, 3, 4], [5, 5, 5]])})

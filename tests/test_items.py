@@ -110,6 +110,24 @@ def test_cut_1_comes_by_height_and_cut_2_by_any_finished_floor() -> None:
     assert ((second[:, 1:, 2] < second[:, :-1, 2]) & (second[:, 1:, 3] > 0)).any()
 
 
+def test_cuts_are_uniform_over_the_positions_of_all_long_edges() -> None:
+    # With edges of 3 … 6 cells a floor of 7 x 9 is first cut at one of two positions across x or of
+    # four across y. Then both parts are cut across the other edge, so only the first cut is one
+    # straight line, unless the two later ones meet.
+    boxes = cut((7, 9, 3), 1, 0, torch.arange(6000), (3, 6)).numpy()
+    assert boxes.shape[1] == 4
+    positions = [np.sort(boxes[:, :, axis])[:, 2:] for axis in (0, 1)]  # the two that are not 0
+    bent_x, bent_y = ((low != high).sum() for low, high in (p.T for p in positions))
+    straight = 6000 - bent_x - bent_y
+    # First across x, 1/3: the cuts across y differ in 3 of 4. First across y, 2/3: in 1 of 2.
+    expected = np.array([1 / 3, 1 / 4, 5 / 12]) * 6000
+    assert stats.chisquare([bent_x, bent_y, straight], expected).pvalue > 1e-4
+    for place, first, last in zip(positions, (3, 3), (4, 6), strict=True):
+        counts = np.bincount(place.ravel(), minlength=7)[first : last + 1]
+        assert counts.sum() == place.size
+        assert counts.min() > 0.9 * counts.mean()
+
+
 @pytest.mark.parametrize("sides", [(3, 4), (11, 30), (0, 5), (5, 2), (2.5, 5)])
 def test_sides_that_no_cut_can_give_are_refused(sides: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=r"cutting|sides"):
@@ -231,6 +249,16 @@ def test_the_published_sequences_are_read(data_folder: Path) -> None:
         sequences, size = load(data_folder / name)
         assert size == BIN
         assert sequences.episodes == 2100
+
+
+@pytest.mark.parametrize("name", ["cut1", "cut2"])
+def test_independent_items_are_those_of_no_episode_that_is_played(name: str) -> None:
+    stream = make_stream(name, BIN, (2, 5))
+    drawn = independent(stream, 5).items.sides.tolist()
+    for seed in range(4):
+        state = stream.start(seed, torch.arange(5))
+        played = [state[:, t].tolist() for t in range(state.shape[1])]
+        assert drawn != [sides for step in played for sides in step if sides[0] > 0]
 
 
 def test_independent_items_are_as_probable_as_in_their_sequences() -> None:

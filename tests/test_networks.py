@@ -122,6 +122,21 @@ def test_every_plane_keeps_the_contract_alone(name: str, agent: str) -> None:
     assert input_channels(mirrored, [name]).shape == channels.shape
 
 
+def test_waste_and_resting_height_are_those_of_the_item_in_its_orientation() -> None:
+    # On a block of 1 x 2 x 2 at x = 0, an item of 2 x 2 x 1 rests at 2 and encloses 1 x 2 x 2 cells.
+    game = Packing(1, (4, 2, 8), [[1, 2, 2], [2, 2, 1], [1, 1, 1]], rule="none")
+    game.place(torch.tensor([0]), torch.tensor([0]))
+    planes = ("resting_height", "waste")
+    for observation in (
+        observed("placement", game, planes, torch.tensor([0])), observed("orientation", game, planes)
+    ):  # fmt: skip
+        assert observation["waste"][0, 0, :3, 0].tolist() == [4, 0, 0]
+        assert observation["resting_height"][0, 0, :3, 0].tolist() == [2, 0, 0]
+    channels = input_channels(observation, planes)
+    assert channels[0, 4, 0, 0] == 2 / 8
+    assert channels[0, 10, 0, 0] == 4 / 5
+
+
 def test_grounded_are_the_columns_without_a_gap() -> None:
     # A box of 2 x 2 x 2, then a plank across it and beyond.
     game = Packing(1, (4, 2, 8), [[2, 2, 2], [3, 2, 1], [1, 1, 1]])

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from conftest import boxes_of
+from conftest import boxes_of, in_play
 
-from marl_pack.agents.heuristics import POLICIES, make_policy
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.heuristics import HEURISTICS, POLICIES, make_policy
 from marl_pack.agents.policy import draw
 from marl_pack.backend import Backend
 from marl_pack.game.moves import Floor, Moves
@@ -383,6 +384,37 @@ def test_heuristics_take_the_placement_of_their_rule() -> None:
     pit = [(0, 1, 2, 2), (3, 3, 2, 3)]
     assert choice("dblf", pit, [3, 2, 1])[2] == 3
     assert choice("best_fit", pit, [3, 2, 1]) == [3, 0, 3]
+
+
+HEURISTIC_KEYS = {
+    "dblf": lambda c: (c["z"], c["x"], c["y"]),
+    "height_min": lambda c: (c["waste"], c["x"] + c["y"]),
+    "best_fit": lambda c: (c["waste"], c["top"], c["x"] + c["y"]),
+    "max_feasible": lambda c: (-c["cells"], c["top"], c["x"] + c["y"]),
+}
+
+
+@pytest.mark.parametrize("steps", [3, 7, 11])
+def test_a_heuristic_breaks_ties_by_its_further_keys_then_by_orientation_and_cell(
+    steps: int,
+) -> None:
+    game = in_play(16, steps, bin=(4, 5, 6), sides=(1, 3), auto_reset=False)
+    cells = Lookahead().feasible_cells(game)
+    chosen = {name: torch.stack(HEURISTICS[name](game), 1).tolist() for name in HEURISTICS}
+    assert chosen.keys() == HEURISTIC_KEYS.keys()
+    for g in game.alive.nonzero().flatten().tolist():
+        candidates = []
+        for o, x, y in game.mask[g].nonzero().tolist():
+            w, d, h = (int(game.items.sides[g, axis]) for axis in ORIENTATIONS[o])
+            window = game.bins.heightmap[g, x : x + w, y : y + d].long()
+            z = int(window.max())
+            candidates.append({
+                "x": x, "y": y, "z": z, "top": z + h, "waste": int((z - window).sum()),
+                "cells": float(cells[g, o, x, y]), "choice": [o, x * 5 + y],
+            })  # fmt: skip
+        for name, keys in HEURISTIC_KEYS.items():
+            best = min(candidates, key=lambda c, keys=keys: (*keys(c), c["choice"]))
+            assert chosen[name][g] == best["choice"], name
 
 
 def test_the_papers_tables_heuristics_are_reproduced_on_the_published_sequences(

@@ -123,6 +123,24 @@ def test_learning_rate_and_entropy_follow_their_schedules() -> None:
         assert ppo.entropy_coef == pytest.approx(0.006)
 
 
+def test_the_kl_that_is_reported_is_that_of_the_old_policy_to_the_new() -> None:
+    runner = make_runner(tiny(), None)
+    obs = rollout(runner)
+    with torch.inference_mode():
+        runner.alg.compute_returns(obs)
+        for ppo in runner.alg.learners.values():  # an old policy far from the new one
+            mask = ppo.storage.observations["mask"]
+            logits = torch.where(mask, 3 * torch.randn(mask.shape), -1e9)
+            ppo.storage.distribution_params[0].copy_(logits.log_softmax(-1))
+    losses = runner.alg.update()
+    for name, ppo in runner.alg.learners.items():
+        old = ppo.storage.distribution_params[0].flatten(0, 1)
+        new = ppo.actor.log_probs(ppo.storage.observations.flatten(0, 1)).detach()
+        kl = float((old.exp() * (old - new)).sum(1).mean())
+        assert losses[f"{name}/kl"] == pytest.approx(kl, rel=1e-4)
+        assert float((new.exp() * (new - old)).sum(1).mean()) != pytest.approx(kl, rel=0.1)
+
+
 @pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
 def test_the_other_schedules_run(schedule: str) -> None:
     runner = make_runner(tiny(f"--ppo.schedule={schedule}", "--ppo.desired_kl=1e-9"), None)
@@ -241,6 +259,11 @@ def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
             log_prob = ppo.actor.get_output_log_prob(storage.actions[step])
             assert torch.allclose(log_prob, storage.actions_log_prob[step, :, 0], atol=1e-5)
             assert (log_prob > -30).all(), "the moved action is legal in what is observed"
+            stored = [parameter[step] for parameter in storage.distribution_params]
+            for old, new in zip(stored, ppo.actor.output_distribution_params, strict=True):
+                assert torch.allclose(old, new, atol=1e-5)
+            values = ppo.critic(storage.observations[step])
+            assert torch.allclose(values, storage.values[step], atol=1e-5)
 
 
 def test_how_often_a_run_is_evaluated_does_not_change_its_weights(tmp_path: Path) -> None:

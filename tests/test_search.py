@@ -15,7 +15,7 @@ from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.agents.search import Planner, SearchSettings
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
-from marl_pack.items import make_stream
+from marl_pack.items import Uniform, make_stream
 
 SIZE = (6, 6, 6)
 NETWORK = {"channels": 8, "layers": 2}
@@ -93,6 +93,64 @@ def test_a_critic_may_value_the_rest_after_a_depth(agents: Agents) -> None:
     planner = Planner(*agents, FlatTops(), settings, FUTURES)  # type: ignore[arg-type]  # a stand-in
     assert utilization(planner) > utilization(in_turns(*agents)) + 0.03
     assert max(batches) > 6  # pairs times futures times games
+
+
+@pytest.mark.parametrize("cell", [(0, 0), (5, 5), (2, 3)])
+def test_the_placement_that_the_critic_values_most_is_taken(
+    agents: Agents, cell: tuple[int, int]
+) -> None:
+    class Covered(torch.nn.Module):
+        """A critic that wants one column covered."""
+
+        def forward(self, observation: dict[str, Tensor]) -> Tensor:
+            return (observation["heightmap"][:, cell[0], cell[1], None] > 0).double()
+
+    settings = SearchSettings(rollouts=1, top=200, depth=1)
+    planner = Planner(*agents, Covered(), settings, FUTURES)  # type: ignore[arg-type]  # a stand-in
+    real = game(2)
+    real.place(*planner(real))
+    assert (real.bins.heightmap[:, cell[0], cell[1]] > 0).all()
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_a_critic_values_the_bin_once_so_many_items_are_placed(agents: Agents, depth: int) -> None:
+    filled: set[float] = set()
+
+    class Counts(torch.nn.Module):
+        """A critic that counts the unit cubes in the bins it values."""
+
+        def forward(self, observation: dict[str, Tensor]) -> Tensor:
+            cells = observation["heightmap"].flatten(1).sum(1, keepdim=True).double()
+            filled.update(cells.flatten().tolist())
+            return 0 * cells
+
+    settings = SearchSettings(rollouts=1, top=4, depth=depth)
+    cubes = make_stream("rs", SIZE, (1, 1))
+    Planner(*agents, Counts(), settings, cubes)(game(1, sides=(1, 1)))  # type: ignore[arg-type]  # a stand-in
+    assert filled == {depth}
+
+
+def test_every_decision_has_futures_of_its_own(agents: Agents) -> None:
+    drawn: set[int] = set()
+
+    class Recorded(Uniform):
+        """A stream that records the keys of its episodes."""
+
+        def start(self, seed: int, episodes: Tensor) -> Tensor:
+            keys = super().start(seed, episodes)
+            drawn.update(keys.tolist())
+            return keys
+
+    planner = Planner(*agents, None, SearchSettings(rollouts=2, top=3), Recorded(1, 3))
+    decisions = []
+    for episode in range(3):
+        real = game(1, episode)
+        for _ in range(3):
+            drawn.clear()
+            real.place(*planner(real))
+            decisions.append(frozenset(drawn))
+    assert all(decisions)
+    assert len(frozenset.union(*decisions)) == sum(map(len, decisions))
 
 
 def test_a_decision_does_not_depend_on_the_batch(agents: Agents) -> None:

@@ -189,6 +189,19 @@ def test_a_margin_shrinks_the_support_polygon(rule: str) -> None:
     assert not ask(rule, bins, (3, 4, 1), margin=1.5).any()  # half of the box itself
 
 
+def test_the_margin_of_equilibrium_is_a_disc_and_holds_for_the_boxes_below() -> None:
+    # A plate of 11 x 11 on four pillars; the side of their hull runs from (11, 1) to (9, 11), on
+    # 5 x + y = 56. The heavy item's middle (8, 6) is 10 / √26 = 1.961 cells from it. That side's
+    # normal lies between two of the directions in which the centre of mass is tried.
+    pillars = [(x, y, 0, 1, 1, 1) for x, y in ((0, 0), (0, 10), (10, 0), (8, 10))]
+    bins = stack((11, 11, 9), *pillars, (0, 0, 1, 11, 11, 1))
+    weights = {"weights": [1, 1, 1, 1, 0.1], "weight": 100.0}
+    for margin, stands in ((1.9, True), (1.98, False)):
+        assert ask("equilibrium", bins, (4, 4, 1), margin=margin, **weights)[6, 4] == stands
+        assert not ask("hull_alpha", bins, (4, 4, 1), margin=margin)[6, 4]
+        assert ask("hull_1", bins, (4, 4, 1), margin=margin)[6, 4]
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_a_rule_can_be_bound_beforehand(rule: str) -> None:
     bins = stack((4, 4, 6), (0, 0, 0, 2, 2, 2))
