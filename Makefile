@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TRAINERS ?= all
 
-.PHONY: help setup test check bounds trainers play train benchmark clean
+.PHONY: help setup test check bounds mutations trainers play train benchmark clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -30,6 +30,9 @@ bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
 	  tests/test_items.py tests/test_packing.py tests/test_stability_rules.py \
 	  tests/test_stability_properties.py
+
+mutations: $(STAMP)  ## wrong lines in copies of the package, and the tests that notice them
+	$(BIN)/python -m tests.mutations --jobs 2
 
 trainers: $(STAMP)  ## every trainer of examples/ in its own environment, briefly (TRAINERS=ci: four)
 	$(BIN)/nox --tags $(TRAINERS)

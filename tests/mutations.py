@@ -9,27 +9,31 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import multiprocessing
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
-from rich.table import Table
+from rich.table import Column, Table
 
 from tests.mutation_table import MUTATIONS, PACKAGE, Mutation
 
 ROOT = Path(__file__).parent.parent
 LEFT_OUT = shutil.ignore_patterns(".*", "build", "runs", "shared", "*.egg-info")
 LONGEST = 600  # seconds that the tests of one mutation may take
+PROCESSES = multiprocessing.get_context("forkserver")  # which imports what all tests do only once
+PRELOADED = ["__main__", "torch", "numba", "scipy.optimize", "tensordict", "rsl_rl.runners"]
 
 
 @dataclass(frozen=True)
@@ -72,23 +76,51 @@ def chosen(names: Sequence[str]) -> list[Mutation]:
     return wanted
 
 
+class Failures:
+    """A plugin of pytest that collects what fails."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Record a test that failed."""
+        if report.failed:
+            self.names.append(report.nodeid)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Record a file that could not be read."""
+        if report.failed:
+            self.names.append(report.nodeid)
+
+
+def work(folder: Path, tests: Sequence[str], result: Connection) -> None:
+    """Run tests in a copy up to the first failure, in a process of their own; send what failed."""
+    os.chdir(folder)
+    os.environ["PYTHONPATH"] = str(folder)
+    sys.path.insert(0, str(folder))
+    sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # until the process ends
+    failures = Failures()
+    options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider"]
+    code = pytest.main([*options, *(f"tests/{test}" for test in tests)], plugins=[failures])
+    result.send(failures.names or ([] if code == 0 else [f"pytest ended with {int(code)}"]))
+
+
 def run_tests(folder: Path, tests: Iterable[str]) -> tuple[str, ...]:
-    """Run tests in a copy up to the first failure, and return what failed."""
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider"]
+    """Return what failed of the tests in a copy, up to the first failure."""
+    receiver, sender = PROCESSES.Pipe(duplex=False)
+    process = PROCESSES.Process(target=work, args=(folder, tuple(tests), sender))
+    process.start()
+    sender.close()
     try:
-        process = subprocess.run(
-            [*command, *(f"tests/{test}" for test in tests)],
-            cwd=folder, env=environment | {"PYTHONPATH": str(folder)}, timeout=LONGEST,
-            capture_output=True, text=True,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return (f"no end after {LONGEST} s",)
-    if process.returncode == 0:
-        return ()
-    lines = process.stdout.splitlines()
-    failed = [line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR "))]
-    return tuple(failed) or (f"pytest ended with {process.returncode}",)
+        if not receiver.poll(LONGEST):
+            return (f"no end after {LONGEST} s",)
+        return tuple(receiver.recv())
+    except EOFError:
+        process.join()
+        return (f"the process ended with {process.exitcode}",)
+    finally:
+        process.kill()
+        process.join()
 
 
 def importers(root: Path, file: str) -> set[Path]:
@@ -130,9 +162,10 @@ def try_mutation(base: Path, mutation: Mutation) -> Result:
 
 def table_of(results: Sequence[Result]) -> Table:
     """Return the table of the mutations and the tests that noticed them."""
-    table = Table("mutation", "file", "noticed by", box=None)
+    table = Table("mutation", "file", Column("noticed by", overflow="fold"), box=None)
     for result in results:
-        noticed = escape(", ".join(result.noticed)) or "[bold red]nothing"
+        names = (name.removeprefix("tests/") for name in result.noticed)
+        noticed = escape(", ".join(names)) or "[bold red]nothing"
         table.add_row(escape(result.mutation.name), result.mutation.file, noticed)
     return table
 
@@ -154,6 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for mutation in mutations:
             print(f"{mutation.name}  ({mutation.file})")
         return 0
+    os.environ.pop("NUMBA_CACHE_DIR", None)  # copies have compiled code beside their files
+    PROCESSES.set_forkserver_preload(PRELOADED)
     with tempfile.TemporaryDirectory(prefix="mutations-") as name:
         base = Path(shutil.copytree(ROOT, Path(name) / "base", ignore=LEFT_OUT))
         console.print("the tests on the unchanged copy …")
@@ -166,8 +201,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             task = bar.add_task("mutations", total=len(mutations))
             for result in pool.map(partial(try_mutation, base), mutations):
                 results.append(result)
-                if not result.noticed:
-                    bar.console.print(f"survived: {escape(result.mutation.name)}")
+                noticed = "[green]noticed" if result.noticed else "[bold red]survived"
+                bar.console.print(f"{noticed}:[/] {escape(result.mutation.name)}")
                 bar.advance(task)
     console.print(table_of(results))
     survivors = sum(not result.noticed for result in results)

@@ -107,6 +107,24 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
         checkpoints.read(path)
 
 
+def test_a_checkpoint_that_cannot_be_written_to_its_end_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "latest.pt"
+    checkpoints.write(path, {"format": 1})
+    before = path.read_bytes()
+
+    class Unwritable:
+        """A part of a checkpoint that cannot be written, as on a full disk."""
+
+        def __reduce__(self) -> str:
+            assert path.read_bytes() == before
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        checkpoints.write(path, {"weights": torch.zeros(1000), "last": Unwritable()})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_mismatched_weights_and_missing_agents_are_named(runs: Path) -> None:
     with pytest.raises(ValueError, match="orientation agent's weights do not match"):
         load_actor({"network": {"c": 1}}, "orientation", "cpu")

@@ -128,6 +128,20 @@ def test_cuts_are_uniform_over_the_positions_of_all_long_edges() -> None:
         assert counts.min() > 0.9 * counts.mean()
 
 
+def test_neighbours_of_cut_1_are_equal_as_often_as_in_the_published_sequences(
+    data_folder: Path,
+) -> None:
+    def share(sides: np.ndarray) -> float:
+        """The share of neighbours in a sequence that are the same box."""
+        present = (sides[:, 1:, 0] > 0) & (sides[:, :-1, 0] > 0)
+        same = (np.sort(sides[:, 1:]) == np.sort(sides[:, :-1])).all(2)
+        return float(same[present].mean())
+
+    published = load(data_folder / "cut_1.npz")[0].items.sides.numpy()
+    own = cut(BIN, 1, 0, torch.arange(8000), (2, 5))[..., 3:].numpy()
+    assert share(own) == pytest.approx(share(published), abs=0.0025)
+
+
 @pytest.mark.parametrize("sides", [(3, 4), (11, 30), (0, 5), (5, 2), (2.5, 5)])
 def test_sides_that_no_cut_can_give_are_refused(sides: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=r"cutting|sides"):

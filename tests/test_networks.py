@@ -123,13 +123,12 @@ def test_every_plane_keeps_the_contract_alone(name: str, agent: str) -> None:
 
 
 def test_waste_and_resting_height_are_those_of_the_item_in_its_orientation() -> None:
-    # On a block of 1 x 2 x 2 at x = 0, an item of 2 x 2 x 1 rests at 2 and encloses 1 x 2 x 2 cells.
+    # On a block of 1 x 2 x 2 at x = 0, an item of 2 x 2 x 1 rests at 2 and encloses 4 cells.
     game = Packing(1, (4, 2, 8), [[1, 2, 2], [2, 2, 1], [1, 1, 1]], rule="none")
     game.place(torch.tensor([0]), torch.tensor([0]))
     planes = ("resting_height", "waste")
-    for observation in (
-        observed("placement", game, planes, torch.tensor([0])), observed("orientation", game, planes)
-    ):  # fmt: skip
+    for agent, *chosen in (("placement", torch.tensor([0])), ("orientation",)):
+        observation = observed(agent, game, planes, *chosen)
         assert observation["waste"][0, 0, :3, 0].tolist() == [4, 0, 0]
         assert observation["resting_height"][0, 0, :3, 0].tolist() == [2, 0, 0]
     channels = input_channels(observation, planes)
