@@ -95,13 +95,15 @@ def test_an_impossible_bin_is_refused(size: tuple[int, ...]) -> None:
         state.empty(1, size)
 
 
-def test_cleared_bins_are_empty_and_the_others_untouched() -> None:
+@pytest.mark.parametrize("which", [[1, 4], [False, True, False, False, True, False]])
+def test_cleared_bins_are_empty_and_the_others_untouched(which: list[int] | list[bool]) -> None:
     bins = random_maps(6, (5, 5, 9), (1, 4), 6, seed=3)
     before = bins.clone()
-    state.clear(bins, torch.tensor([1, 4]))
+    state.clear(bins, torch.tensor(which))
     others = torch.tensor([0, 2, 3, 5])
-    assert int(bins.filled[[1, 4]].sum()) == 0
-    assert int(bins.heightmap[[1, 4]].sum()) == 0
+    for name in ("heightmap", "empty_map", "count", "filled"):
+        assert getattr(before, name)[[1, 4]].any(), name
+        assert not getattr(bins, name)[[1, 4]].any(), name
     for now, then in zip(bins[others].tensors(), before[others].tensors(), strict=True):
         assert torch.equal(now, then)
 

@@ -123,6 +123,10 @@ def test_a_checkpoint_that_cannot_be_written_to_its_end_leaves_the_old_one(tmp_p
         checkpoints.write(path, {"weights": torch.zeros(1000), "last": Unwritable()})
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+    with path.open("rb") as reader:  # who has begun to read the old one reads it to its end
+        checkpoints.write(path, {"format": 2})
+        assert reader.read() == before
+    assert path.read_bytes() != before
 
 
 def test_mismatched_weights_and_missing_agents_are_named(runs: Path) -> None:

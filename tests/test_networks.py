@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import in_play
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic
@@ -15,6 +16,7 @@ from marl_pack.agents.networks.planes import PLANES, channel_names, input_channe
 from marl_pack.agents.networks.symmetry import transform
 from marl_pack.agents.networks.trunk import Network, Trunk, widen
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 
 ALL_PLANES = tuple(PLANES)
 SMALL = {"channels": 8, "layers": 2, "hidden": 16, "planes": []}
@@ -134,6 +136,17 @@ def test_waste_and_resting_height_are_those_of_the_item_in_its_orientation() -> 
     channels = input_channels(observation, planes)
     assert channels[0, 4, 0, 0] == 2 / 8
     assert channels[0, 10, 0, 0] == 4 / 5
+
+
+def test_the_placement_agent_sees_the_item_as_it_is_oriented() -> None:
+    planes = ("mask", "resting_height", "waste")
+    game = in_play(4, 5, bin=(5, 6, 8), sides=(1, 3))
+    before = observed("orientation", game, planes)
+    for o, axes in enumerate(ORIENTATIONS):
+        observation = observed("placement", game, planes, torch.full((4,), o))
+        assert torch.equal(observation["item"], game.items.sides[:, list(axes)])
+        for name in ("legal_cells", "resting_height", "waste"):
+            assert torch.equal(observation[name][:, 0], before[name][:, o])
 
 
 def test_grounded_are_the_columns_without_a_gap() -> None:
