@@ -67,10 +67,23 @@ def test_a_branch_shows_its_item_and_then_those_of_another_stream() -> None:
     whole = game(2)
     whole.place(*make_policy("dblf")(whole))
     stream = make_stream([[1, 1, 1], [2, 2, 2], [3, 3, 3]], SIZE)
-    part = whole.branch(torch.tensor([0, 0]), stream, seed=0, episodes=torch.tensor([0, 0]))
+    part = whole.branch(torch.tensor([0, 0]), stream, seed=0, episodes=torch.tensor([4, 5]))
+    assert part.episode.tolist() == [4, 5]
     assert torch.equal(part.items.sides[0], whole.items.sides[0])
     part.place(*make_policy("dblf")(part))
     assert part.items.sides.tolist() == [[3, 3, 3], [3, 3, 3]]
+
+
+def test_a_branch_of_games_that_restart_ends_with_its_episode() -> None:
+    whole, first = Packing(2, (2, 2, 2), [[2, 2, 1], [2, 2, 1]]), torch.zeros(2, dtype=torch.int64)
+    part = whole.branch(torch.tensor([0, 1]))
+    for game_of_two in (whole, part):
+        for _ in range(2):
+            game_of_two.place(first, first)
+    assert whole.episode.tolist() == [2, 3]
+    assert part.episode.tolist() == [0, 1]
+    assert not part.alive.any()
+    assert part.bins.filled.tolist() == [8, 8]
 
 
 def test_searching_beats_the_same_agents_without(agents: Agents) -> None:

@@ -66,6 +66,14 @@ def test_diagonal_pillars_hold_only_what_lies_between_their_outer_corners(rule: 
     assert not ask(rule, bins, (6, 4, 1))[0, 0]
 
 
+def test_a_stack_that_is_exactly_balanced_is_not_in_strict_equilibrium() -> None:
+    # Seen from the front, B's middle is over A's edge if B is 4 wide:   B B B B
+    #                                                                    A A . .
+    for width, stands in ((3, True), (4, False), (5, False)):
+        boxes = [(0, 0, 0, 2, 2, 1), (0, 0, 1, width, 2, 1)]
+        assert in_equilibrium(np.array(boxes)) == stands
+
+
 def test_three_pillars_hold_their_triangle() -> None:
     bins = stack((5, 5, 9), (0, 0, 0, 1, 1, 2), (4, 0, 0, 1, 1, 2), (0, 4, 0, 1, 1, 2))
     assert ask("hull_alpha", bins, (5, 5, 1))[0, 0]  # (2.5, 2.5) on x + y = 5, hull up to x + y = 6
