@@ -105,15 +105,15 @@ def work(folder: Path, tests: Sequence[str], result: Connection) -> None:
     result.send(failures.names or ([] if code == 0 else [f"pytest ended with {int(code)}"]))
 
 
-def run_tests(folder: Path, tests: Iterable[str]) -> tuple[str, ...]:
-    """Return what failed of the tests in a copy, up to the first failure."""
+def run_tests(folder: Path, tests: Iterable[str], limit: float | None = None) -> tuple[str, ...]:
+    """Return what failed of the tests in a copy, up to the first failure; stop after ``limit`` s."""
     receiver, sender = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=work, args=(folder, tuple(tests), sender))
     process.start()
     sender.close()
     try:
-        if not receiver.poll(LONGEST):
-            return (f"no end after {LONGEST} s",)
+        if not receiver.poll(limit):
+            return (f"no end after {limit} s",)
         return tuple(receiver.recv())
     except EOFError:
         process.join()
@@ -157,7 +157,7 @@ def try_mutation(base: Path, mutation: Mutation) -> Result:
         (folder / PACKAGE / mutation.file).write_text(text)
         if "@njit" in text:
             forget_compiled_callers(folder, mutation.file)
-        return Result(mutation, run_tests(folder, mutation.tests))
+        return Result(mutation, run_tests(folder, mutation.tests, LONGEST))
 
 
 def table_of(results: Sequence[Result]) -> Table:

@@ -171,6 +171,8 @@ def test_a_lookahead_belongs_to_one_turn_of_one_game() -> None:
     game, lookahead = in_play(4, 3), Lookahead()
     first = lookahead.feasible_cells(game)
     assert lookahead.feasible_cells(game) is first
+    plain = game.branch(torch.tensor([2, 0]))
+    assert torch.equal(lookahead.feasible_cells(plain), first[[2, 0]])
     copy = lookahead.branch(game, torch.tensor([2, 0]))
     assert torch.equal(lookahead.feasible_cells(copy), first[[2, 0]])
     assert torch.equal(lookahead.feasible_cells(game), first)
