@@ -106,7 +106,7 @@ def work(folder: Path, tests: Sequence[str], result: Connection) -> None:
 
 
 def run_tests(folder: Path, tests: Iterable[str], limit: float | None = None) -> tuple[str, ...]:
-    """Return what failed of the tests in a copy, up to the first failure; stop after ``limit`` s."""
+    """Return what failed of a copy's tests, up to the first failure; end after ``limit`` s."""
     receiver, sender = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=work, args=(folder, tuple(tests), sender))
     process.start()
