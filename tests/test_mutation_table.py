@@ -13,6 +13,7 @@ def test_a_mutation_has_one_place_in_the_code_and_tests_that_exist(mutation: Mut
     code = (TESTS.parent / PACKAGE / mutation.file).read_text()
     assert code.count(mutation.old) == 1, "the record needs to follow the code"
     assert mutation.new != mutation.old
+    assert mutation.tests
     for test in mutation.tests:
         file, _, name = test.partition("::")
         assert f"def {name}(" in (TESTS / file).read_text() or not name
