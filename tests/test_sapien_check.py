@@ -241,6 +241,18 @@ def test_a_stack_of_too_many_boxes_is_refused() -> None:
         Stack.of_cells((60, 60, 60), cubes, mass=1.0)
 
 
+def test_boxes_move_alike_in_every_unit_of_length() -> None:
+    cells = (0.0006, 0.06, 6.0)
+    small, usual, large = (
+        check(Stack.of_cells(BIN, [FLAT, (2, 0, 2, 5, 4, 1)], cell=cell, mass=1.0))
+        for cell in cells
+    )
+    for verdict, cell in ((small, cells[0]), (large, cells[2])):
+        assert verdict.seconds == pytest.approx(usual.seconds)
+        assert verdict.angle == pytest.approx(usual.angle, rel=0.05, abs=0.01)
+        assert verdict.distance / cell == pytest.approx(usual.distance / 0.06, rel=0.05, abs=1e-3)
+
+
 def test_heavy_boxes_on_light_ones_stand() -> None:
     column = [(0, 0, k, 4, 4, 1) for k in range(8)]
     for ratio in (1e3, 9e3):
