@@ -110,6 +110,14 @@ def test_cut_1_comes_by_height_and_cut_2_by_any_finished_floor() -> None:
     assert ((second[:, 1:, 2] < second[:, :-1, 2]) & (second[:, 1:, 3] > 0)).any()
 
 
+def test_after_the_last_piece_of_a_cut_bin_there_is_no_item() -> None:
+    stream = make_stream("cut1", (6, 6, 6), (2, 4))
+    state = stream.start(0, torch.arange(5))
+    pieces = [stream.item(state, torch.full((5,), t)).present for t in range(state.shape[1] + 3)]
+    assert bool(pieces[0].all())
+    assert not torch.stack(pieces[state.shape[1] :]).any()
+
+
 def test_cuts_are_uniform_over_the_positions_of_all_long_edges() -> None:
     # With edges of 3 … 6 cells a floor of 7 x 9 is first cut at one of two positions across x or of
     # four across y. Then both parts are cut across the other edge, so only the first cut is one

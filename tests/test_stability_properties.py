@@ -315,6 +315,16 @@ def test_a_bins_mask_does_not_depend_on_the_others(rule: str) -> None:
         assert torch.equal(bound(bins[alone], item[alone])[0], together[b])
 
 
+def test_an_orientation_that_is_not_allowed_changes_no_other_ones_mask() -> None:
+    bins = random_play(hull_alpha, 40, (7, 7, 12), (1, 5), 14, seed=25)
+    sides = some_items(40, (1, 5), 26)
+    item, others = orient_item(sides), orient_item(sides)
+    others.sides[:, 0] = 0
+    for rule in RULES:
+        bound = make_rule(rule)
+        assert torch.equal(bound(bins, others)[:, 1:], bound(bins, item)[:, 1:])
+
+
 def test_orientations_with_a_zero_side_have_no_cell() -> None:
     bins = random_play(hull_alpha, 8, (6, 6, 9), (1, 4), 6, seed=24)
     for rule in RULES:

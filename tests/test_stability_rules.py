@@ -100,6 +100,16 @@ def test_the_papers_figure_a_heavy_box_on_an_overhang() -> None:
         assert ask(rule, bins, heavy)[1, 0], rule
 
 
+def test_weights_belong_to_their_boxes_in_whatever_order_these_are_given() -> None:
+    # As above: K on the left end of P holds it down. K comes first in the list.
+    boxes = np.array([[0, 0, 2, 2, 1, 5], [0, 0, 0, 3, 1, 1], [0, 0, 1, 5, 1, 1]])
+    bins = stack((5, 1, 9), *map(tuple, boxes[[1, 2, 0]].tolist()))
+    maps = bins.heightmap[0].numpy(), bins.empty_map[0].numpy()
+    for weights, stands in (([9.0, 1.0, 1.0], True), ([0.01, 9.0, 1.0], False)):
+        mask = stable_mask("equilibrium", *maps, (1, 1, 1), 9, boxes, weights=weights, weight=1.0)
+        assert mask[4, 0] == stands
+
+
 def test_a_counterweight_counts_in_equilibrium_alone() -> None:
     # The plank's end carries little, since a heavy box holds its other end down.
     #   K K
