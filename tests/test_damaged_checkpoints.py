@@ -303,7 +303,8 @@ def test_every_state_that_games_come_into_is_restored(options: dict[str, Any]) -
     ("agents/placement/network/residual", False, "placement.network: is not that of config"),
     ("iter", 5, "schedule_iteration = 1: needs 6 after 6 iterations"),
     ("evaluations", [{"seed": 1}], "evaluations.0.utilization: needs a number"),
-    ("config/ppo/num_envs", 10**9, "items = 64: needs 4000000000 after 1 iterations"),
+    ("config/ppo/num_envs", 1000, "items = 64: needs 4000 after 1 iterations"),
+    ("config/ppo/num_envs", 10**9, "ppo.num_envs = 1000000000: needs a number from 1 to"),
 ])  # fmt: skip
 def test_a_run_resumes_only_from_what_it_could_have_written(
     path: str, value: Any, message: str, content: dict[str, Any], tmp_path: Path,
