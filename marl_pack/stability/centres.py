@@ -32,7 +32,13 @@ def exact(value: float | Fraction) -> Fraction:
     Raises:
         ValueError: for NaN and infinity.
     """
-    return value if isinstance(value, Fraction) else Fraction(str(value))
+    return value if isinstance(value, Fraction) else _decimal(float(value))
+
+
+@lru_cache(maxsize=1 << 14)  # the same weights and centres come again and again
+def _decimal(value: float) -> Fraction:
+    """Return the fraction that the shortest decimal of a float stands for."""
+    return Fraction(str(value))
 
 
 @dataclass(frozen=True)

@@ -156,12 +156,12 @@ def _stands_exactly(
     w, d, h = item.sides[b, a].tolist()
     z = int(stack.heightmap[b, x : x + w, y : y + d].max())
     boxes = np.vstack((stack.boxes[b, :k].numpy(), (x, y, z, w, d, h))).astype(np.int64)
-    loads = [Load(*map(exact, row)) for row in stack.loads[b, :k].tolist()]
+    loads = stack.loads[b, :k].numpy()
     weight = exact(float(item.weights()[b]))
     com = item.exact_centre(a, w, d)
     return all(
         stands_by_fractions(
-            boxes, [*loads, Load(weight, x + com[0] + dx, y + com[1] + dy)], stack.size[:2], whole
+            boxes, loads, Load(weight, x + com[0] + dx, y + com[1] + dy), stack.size[:2], whole
         )
         for dx, dy in shifts
     )

@@ -24,7 +24,6 @@ program is solved in whole numbers (:func:`stands_by_fractions`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 
 from marl_pack.geometry.compiled import place_box
 from marl_pack.installation import njit
+from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 from marl_pack.stability.hull_exact import envelope, row_extremes
 from marl_pack.stability.simplex import NEAR, max_least_force
@@ -245,13 +245,18 @@ def stands(
 
 
 def stands_by_fractions(
-    boxes: NDArray[np.int64], loads: Sequence[Load], shape: tuple[int, int], whole: bool
+    boxes: NDArray[np.int64],
+    loads: NDArray[np.float64],
+    new: Load,
+    shape: tuple[int, int],
+    whole: bool,
 ) -> bool:
     """Decide in exact arithmetic what :func:`stands` decides.
 
     Args:
         boxes: int64 [n + 1, 6], rows x, y, z, w, d, h in order of placement; the last one is new.
-        loads: of these boxes.
+        loads: float64 [n, 3], of the boxes before; decimals mean what they say.
+        new: the load of the new box.
         shape: (W, D).
         whole: as for :func:`stands`.
     """
@@ -272,4 +277,5 @@ def stands_by_fractions(
                 x0, y0, x1, y1 = map(int, _overlap(boxes[i], boxes[j]))
                 for x, y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
                     forces.append(Force(x, y, int(row[i]), int(row[j])))
-    return stands_exactly([loads[i] for i in members.tolist()], forces)
+    own = [new if i == n else Load(*map(exact, loads[i].tolist())) for i in members.tolist()]
+    return stands_exactly(own, forces)
