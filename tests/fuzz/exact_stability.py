@@ -56,7 +56,7 @@ def mirrored(bins: Bins, item: OrientedItem) -> tuple[Bins, OrientedItem]:
 
 
 def check_hulls(seed: int, windows: int) -> int:
-    """Compare ``hull_1``, ``hull_alpha`` and ``area_ratio`` with the reference on every backend.
+    """Compare the hull rules and ``area_ratio`` with the reference on every backend.
 
     Returns:
         The number of windows compared, at least ``windows``.
@@ -82,6 +82,7 @@ def check_hulls(seed: int, windows: int) -> int:
         rules = {
             "hull_1": {"margin": margin},
             "hull_alpha": {"margin": margin},
+            "lbcp": {"margin": margin},
             "area_ratio": {"thresholds": thresholds},
         }
         for name, parameters in rules.items():
@@ -96,7 +97,7 @@ def check_hulls(seed: int, windows: int) -> int:
             for a in range(2):
                 places = size[0] - int(sides[0]) + 1
                 flipped = mask[:, a, :places][:, ::-1]
-                if name != "area_ratio":
+                if name in ("hull_1", "hull_alpha"):
                     _compare(flipped, expected[:, a, :places], f"{name} mirrored", bins, item)
     return compared
 
@@ -117,7 +118,14 @@ def _expected(
     n, orientations = item.sides.shape[:2]
     masks = np.zeros((n, orientations, *bins.size[:2]), np.bool_)
     for b in range(n):
-        heights, empty = bins.heightmap[b].numpy(), bins.empty_map[b].numpy()
+        heights = bins.heightmap[b].numpy()
+        bearing = {
+            "hull_1": np.ones(heights.shape, np.bool_),
+            "hull_alpha": bins.empty_map[b].numpy() == 0,
+            "lbcp": reference.lbcp_bearing(
+                heights.shape, bins.boxes[b, : int(bins.count[b])].numpy()
+            ),
+        }.get(name)
         for a in range(orientations):
             w, d, h = item.sides[b, a].tolist()
             com = item.exact_centre(a, w, d)
@@ -126,8 +134,7 @@ def _expected(
                 window = np.s_[x : x + w, y : y + d]  # noqa: B023  # called at once
                 if name == "area_ratio":
                     return reference.area_ratio(heights[window], thresholds)  # noqa: B023
-                bearing = np.ones((w, d), bool) if name == "hull_1" else empty[window] == 0  # noqa: B023
-                return reference.hull(heights[window], bearing, com, margin)  # noqa: B023
+                return reference.hull(heights[window], bearing[window], com, margin)  # noqa: B023
 
             masks[b, a] = reference.window_mask(stands, heights, (w, d, h), bins.height)
     return masks
