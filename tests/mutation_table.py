@@ -316,7 +316,7 @@ MUTATIONS = (
        "if least_force(boxes, rounded) > NEAR:", "if least_force(boxes, rounded) > -NEAR:",
        "stability_rules::a_stack_that_is_exactly_balanced_is_not_in_strict_equilibrium"),
     _m("stability: a tie stands (reduced program)", "stability/reduced_equilibrium.py",
-       "if not reliable or abs(force) <= NEAR:\n" "        return UNSURE\n"
+       "if not reliable or nearly_a_tie(force, reach):\n" "        return UNSURE\n"
        "    return YES if force > 0 else NO",
        "if not reliable:\n        return UNSURE\n    return YES if force > -NEAR else NO",
        "stability_rules::a_counterweight_counts_in_equilibrium_alone",
@@ -391,7 +391,7 @@ MUTATIONS = (
        "low[a, axis, side] = math.ceil(float(centre) - margin)",
        "exact_stability::hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge"),
     _m("stability: the float simplex decides near a tie", "stability/reduced_equilibrium.py",
-       "if not reliable or abs(force) <= NEAR:", "if not reliable:",
+       "if not reliable or nearly_a_tie(force, reach):", "if not reliable:",
        "exact_stability::equilibrium_equals_exact_fractions_at_the_edge"),
     _m("stability: a small pivot is trusted", "stability/simplex.py",
        "if row < 0 or table[row, column] < SMALLEST_PIVOT:", "if row < 0:",

@@ -24,7 +24,7 @@ from math import lcm
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.stability.simplex import NEAR, max_least_force
+from marl_pack.stability.simplex import NEAR, max_least_force, nearly_a_tie
 
 Whole = NDArray[np.object_]
 """Array of Python's whole numbers, which have no largest value."""
@@ -73,7 +73,8 @@ def stands_exactly(loads: Sequence[Load], forces: Iterable[Force]) -> bool:
     largest = np.abs(rounded).max(1, initial=1.0)
     rounded /= largest[:, None]
     force, reliable, basis = max_least_force(rounded, relative, 10 * NEAR)
-    if reliable and abs(force) > NEAR:
+    places = [place for column in columns for place in (column.x, column.y)]
+    if reliable and not nearly_a_tie(force, max(places) - min(places)):
         return bool(force > 0)
     motion = _motion(rounded, basis) / largest
     return not _moves_freely(a, weights, motion) and _strictly_feasible(a, weights)

@@ -34,7 +34,7 @@ from marl_pack.installation import njit
 from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 from marl_pack.stability.hull_exact import envelope, row_extremes
-from marl_pack.stability.simplex import NEAR, max_least_force
+from marl_pack.stability.simplex import NEAR, max_least_force, nearly_a_tie
 
 NO, YES, UNSURE = 0, 1, 2
 
@@ -239,7 +239,10 @@ def stands(
     members, row, forces = _component(boxes, n, grounded, count, whole)
     a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
     force, reliable, _ = max_least_force(a, weight, 10 * NEAR)
-    if not reliable or abs(force) <= NEAR:
+    reach = 0
+    for i in members:
+        reach = max(reach, boxes[i, 3], boxes[i, 4])
+    if not reliable or nearly_a_tie(force, reach):
         return UNSURE
     return YES if force > 0 else NO
 

@@ -14,10 +14,26 @@ from marl_pack.installation import njit
 
 NEAR = 1e-6
 """Least force, or least error of the equations, in mean weights, above which float64 decides."""
+RESIDUAL = 1e-9
+"""Largest sum of the equations' errors that is left to rounding."""
 
 
 SMALLEST_PIVOT = 1e-6
 """A division by less than this may blow up rounding errors, so float64 is not trusted then."""
+
+
+@njit(cache=True, inline="always")
+def nearly_a_tie(force: float, reach: float) -> bool:
+    """Return whether rounding errors might change the sign of a least force.
+
+    A contact is at least one cell wide, so to make up for an error takes at most as many times the
+    error as the boxes reach.
+
+    Args:
+        force: as :func:`max_least_force` returns it.
+        reach: cells from one end of the boxes to the other.
+    """
+    return abs(force) <= max(NEAR, 2 * RESIDUAL * reach)
 
 
 @njit(cache=True)
@@ -146,5 +162,5 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool, An
         missing = 0.0
 
     t, lacking, least = _solution(table, basis, a, weight)
-    reliable = reliable and abs(lacking - missing) < 1e-9 and least > -1e-9
+    reliable = reliable and abs(lacking - missing) < RESIDUAL and least > -1e-9
     return (t if feasible else -missing), reliable, basis
