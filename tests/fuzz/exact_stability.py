@@ -24,23 +24,40 @@ def decimal(generator: Generator, low: float, high: float) -> float:
     return round(value, int(generator.choice([1, 1, 2, 2, 3, 6, 12, 17])))
 
 
-def offset_at(generator: Generator, side: int) -> float:
-    """Return an offset that often puts the centre of mass on the edge of a cell, or next to it."""
+def offset_at(generator: Generator, side: int, short: bool = False) -> float:
+    """Return an offset that often puts the centre of mass on the edge of a cell, or next to it.
+
+    Args:
+        generator: of random numbers.
+        side: the item's side in cells.
+        short: whether to take decimals of few digits only.
+    """
     if generator.random() < 0.3:
-        return decimal(generator, -0.44, 0.44)
-    place = generator.integers(1, 2 * side) / (2 * side)  # half a cell is an edge of other hulls
+        return round(decimal(generator, -0.44, 0.44), 2 if short else 17)
+    place = Fraction(int(generator.integers(1, 2 * side)), 2 * side) - Fraction(1, 2)
+    if short:
+        return float(round(place, 3))  # half a cell is an edge of other hulls
     nudge = generator.choice([0.0, 0.0, 0.0, 1e-17, -1e-17, 1e-9, -1e-9])
-    return float(np.clip(float(Fraction(place).limit_denominator(99)) - 0.5 + nudge, -0.49, 0.49))
+    return float(np.clip(float(place) + nudge, -0.49, 0.49))
 
 
 def random_stacks(generator: Generator, n: int, size: tuple[int, int, int]) -> Bins:
-    """Return bins with boxes placed anywhere, and sides that make ties likely."""
+    """Return bins with boxes placed anywhere: pillars of one cell, or larger boxes.
+
+    Pillars make hulls with slanted edges, which pass through many corners of cells.
+    """
     bins = bin_state.empty(n, size, max_boxes=6)
-    for _ in range(int(generator.integers(1, 6))):
-        sides = generator.integers(*BOX_SIDES, (n, 3), endpoint=True)
-        sides = np.minimum(sides, [*size[:2], 2])
+    pillars = generator.random() < 0.6
+    for _ in range(int(generator.integers(2, 7))):
+        sides = np.ones((n, 3), np.int64)
+        if not pillars:
+            sides = generator.integers(*BOX_SIDES, (n, 3), endpoint=True)
+            sides = np.minimum(sides, [*size[:2], 2])
         corners = np.stack([generator.integers(0, size[k] - sides[:, k] + 1) for k in (0, 1)], 1)
         room = bins.heightmap.amax((1, 2)).numpy() + sides[:, 2] < size[2]
+        if pillars:
+            taken = bins.heightmap.numpy()[np.arange(n), corners[:, 0], corners[:, 1]] > 0
+            room &= ~taken
         placed = torch.from_numpy(np.where(room[:, None], sides, 0).astype(np.int16))
         bin_state.place(bins, placed, torch.from_numpy(corners))
     return bins
@@ -70,9 +87,13 @@ def check_hulls(seed: int, windows: int) -> int:
         size = (int(generator.integers(2, 9)), int(generator.integers(2, 9)), 9)
         bins = random_stacks(generator, 4, size)
         sides = np.minimum(generator.integers(1, 8, 3), [*size[:2], 7])
+        short = bool(generator.random() < 0.6)
         item = OrientedItem(
             torch.from_numpy(np.tile(sides.astype(np.int16), (4, 2, 1))),
-            tuple((offset_at(generator, sides[0]), offset_at(generator, sides[1])) for _ in "ab"),
+            tuple(
+                (offset_at(generator, sides[0], short), offset_at(generator, sides[1], short))
+                for _ in "ab"
+            ),
         )
         margin = float(generator.choice([0, 0, 0.1, 0.3, 0.5, 0.7, 1, decimal(generator, 0, 2)]))
         thresholds = (
