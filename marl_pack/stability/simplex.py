@@ -15,7 +15,6 @@ from marl_pack.installation import njit
 NEAR = 1e-6
 """Least force, or least error of the equations, in mean weights, above which float64 decides."""
 
-
 SMALLEST_PIVOT = 1e-6
 """A division by less than this may blow up rounding errors, so float64 is not trusted then."""
 
