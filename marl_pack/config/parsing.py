@@ -277,8 +277,8 @@ def explain(parser: ArgumentParser, message: str) -> str:
     wrong = re.match(r'Parser key "([\w.]+)": ', message)
     if wrong is not None and wrong[1] in TYPES:
         value = re.search(r".*(?:Got|Given) value: (.*)$", message)
-        given = shown(value[1])[1:-1] if value else "a value"
-        return f"{wrong[1]} = {'null' if given == 'None' else given}: needs {in_words(wrong[1])}"
+        text = shown(value[1])[1:-1] if value else "a value"
+        return f"{wrong[1]} = {'null' if text == 'None' else text}: needs {in_words(wrong[1])}"
     inside = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
     beside = re.search(r"[Uu]nrecognized arguments: (.*)", message)
     alone = re.search(r"Option '([^']*)' is not accepted", message)

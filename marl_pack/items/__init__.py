@@ -1,7 +1,7 @@
 """Items to be packed: their attributes, streams that bring them, and files of them."""
 
+from marl_pack.items.checking import check_items
 from marl_pack.items.cutting import cut
-from marl_pack.items.given import check_items
 from marl_pack.items.items import ATTRIBUTES, Attribute, Items
 from marl_pack.items.sequences import Sequences
 from marl_pack.items.sources import DEFAULT_SIDES, GENERATED, choose_stream, load, make_stream

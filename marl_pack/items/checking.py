@@ -91,13 +91,13 @@ def check_items(
     ends = _ends(rows, lengths)
     inside = _before(ends, rows.counts)
     rows.refuse(~inside & rows.sides.any(1), "after the end of its sequence; needs zeros there")
-    given = {a: _flatten(attributes[a.key], rows) for a in ATTRIBUTES
-             if attributes.get(a.key) is not None}  # fmt: skip
+    flat = {a: _flatten(attributes[a.key], rows) for a in ATTRIBUTES
+            if attributes.get(a.key) is not None}  # fmt: skip
     rows = replace(rows, sides=rows.sides[inside].astype(np.float64), counts=ends)
     _check_sides(rows)
     values = {
         attribute.key: _read_attribute(attribute, column, inside, rows)
-        for attribute, column in given.items()
+        for attribute, column in flat.items()
     }
     quantity, upright = values.pop("quantity", None), values.pop("upright", None)
     allowed = _allowed(values.pop("orientations", None), upright, rows)
