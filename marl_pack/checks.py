@@ -27,6 +27,21 @@ TYPE_NAMES = {
 """What a value of a type is called in messages."""
 
 
+def truth_value(value: Any, what: str) -> bool:
+    """Return a truth value as a bool: a bool or a NumPy bool, no number or text.
+
+    Args:
+        value: to check.
+        what: names the value, for the message.
+
+    Raises:
+        ValueError: naming the value and what it needs to be.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{what} = {shown(value)}: needs {TYPE_NAMES[bool]}")
+    return bool(value)
+
+
 def whole_number(value: Any, what: str, low: int, high: int | None = None) -> int:
     """Return a whole number as an int: an int or a NumPy integer, no bool, float or text.
 
@@ -64,21 +79,6 @@ def real_number(value: Any, what: str) -> float:
         if math.isfinite(number):
             return number
     raise ValueError(f"{what}: needs a finite number, not {shown(value)}")
-
-
-def truth_value(value: Any, what: str) -> bool:
-    """Return a truth value as a bool: a bool or a NumPy bool, no number or text.
-
-    Args:
-        value: to check.
-        what: names the value, for the message.
-
-    Raises:
-        ValueError: naming the value and what it needs to be.
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{what} = {shown(value)}: needs {TYPE_NAMES[bool]}")
-    return bool(value)
 
 
 @lru_cache(maxsize=1 << 14)  # the cells of a table repeat

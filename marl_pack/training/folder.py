@@ -6,6 +6,7 @@ import contextlib
 import csv
 import datetime
 import io
+import json
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,6 @@ from marl_pack.agents.learning.resuming import check_progress
 from marl_pack.agents.loading import trained_game
 from marl_pack.config import Config, ConfigError, from_dict, parse
 from marl_pack.files import PART, remove_unfinished, write_atomically, write_json
-from marl_pack.inputs import read_json
 
 PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
 SETTINGS, RECORD, LOCK = "config.yaml", "run.json", ".lock"
@@ -74,10 +74,10 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        record = read_json(path)
+        record = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(record["arguments"], list) and isinstance(record.get("resumed", []), list):
             return dict(record)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         pass
     raise ConfigError(
         f"{path}: not the record of a run; move it away, resuming needs {checkpoints.LATEST} alone"
