@@ -4,8 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TRAINERS ?= all
+MINUTES ?= 20
 
-.PHONY: help setup test check bounds mutations trainers play train benchmark clean
+.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -30,6 +31,9 @@ bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
 	  tests/test_items.py tests/test_packing.py tests/test_stability_rules.py \
 	  tests/test_stability_properties.py
+
+fuzz: $(STAMP)  ## bad and hard input at random, for MINUTES=20
+	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
 mutations: $(STAMP)  ## wrong lines in copies of the package, and the tests that notice them
 	$(BIN)/python -m tests.mutations --jobs 2

@@ -1,4 +1,4 @@
-"""Check single values: whole numbers and real numbers are what they say, and nothing else."""
+"""Check single values and describe them in messages: each is what it says, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,6 +14,32 @@ DECIMAL = frozenset("0123456789+-.eE")
 
 LONGEST_TEXT = 60
 """Number of characters of a value that a message shows."""
+LONGEST_LINE = 1000
+"""Number of characters of a whole message."""
+
+LARGEST_SEED = 2**63 - 1
+"""The largest seed that a user may give."""
+
+TYPE_NAMES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
+    type(None): "null",
+}  # fmt: skip
+"""What a value of a type is called in messages."""
+
+
+def truth_value(value: Any, what: str) -> bool:
+    """Return a truth value as a bool: a bool or a NumPy bool, no number or text.
+
+    Args:
+        value: to check.
+        what: names the value, for the message.
+
+    Raises:
+        ValueError: naming the value and what it needs to be.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{what} = {shown(value)}: needs {TYPE_NAMES[bool]}")
+    return bool(value)
 
 
 def whole_number(value: Any, what: str, low: int, high: int | None = None) -> int:
@@ -76,10 +102,23 @@ def shown(value: Any) -> str:
         text = repr(value.item() if isinstance(value, np.generic) else value)
     except (ValueError, RecursionError):  # an int of more digits than Python writes
         text = f"a {type(value).__name__} that is too long to show"
-    return one_line(text)
+    return one_line(text, LONGEST_TEXT)
 
 
-def one_line(text: str, longest: int = LONGEST_TEXT) -> str:
-    """Return a text in one line, cut off after ``longest`` characters."""
-    line = " ".join(text.split())
+def described(value: Any) -> str:
+    """Return a few words for a value: an array or a tensor by its type and shape."""
+    if isinstance(value, np.generic) or not hasattr(value, "dtype"):
+        return shown(value)
+    kind = "a NumPy array of " if isinstance(value, np.ndarray) else ""
+    return f"{kind}{str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
+
+
+def printable(text: str) -> str:
+    """Return a text whose characters can all be printed, the others as escapes."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def one_line(text: str, longest: int = LONGEST_LINE) -> str:
+    """Return a text as one line of printable characters, cut off after ``longest``."""
+    line = printable(" ".join(text.split()))
     return line if len(line) <= longest else f"{line[: longest - 3]}..."

@@ -56,8 +56,8 @@ from pettingzoo.utils.conversions import (
     turn_based_aec_to_parallel_wrapper,
 )
 
-from marl_pack.checks import real_number, shown, whole_number
-from marl_pack.game.packing import MOST_SEED, Packing
+from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
+from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, document, with_options
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
@@ -104,8 +104,7 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
     Raises:
         ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
     """
-    _true_or_false("simultaneous", simultaneous)
-    if simultaneous and kwargs.get("illegal") != "repair":
+    if truth_value(simultaneous, "simultaneous") and kwargs.get("illegal") != "repair":
         raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
     return (AtOnce if simultaneous else Turns)(env(**kwargs))
 
@@ -241,9 +240,9 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             _one_of("render_mode", render_mode, RENDER_MODES)
         if max_cycles is not None:
             max_cycles = whole_number(max_cycles, "max_cycles (None for no limit)", 1)
-        _true_or_false("pad_actions", pad_actions)
         self.render_mode, self.max_cycles = render_mode, max_cycles
-        self.pad_actions, self.mask_in, self.illegal = pad_actions, mask_in, illegal
+        self.pad_actions = truth_value(pad_actions, "pad_actions")
+        self.mask_in, self.illegal = mask_in, illegal
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
@@ -311,7 +310,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
         episode = self._episode if seed is None else -1
         if seed is not None:
-            seed = whole_number(seed, "seed", 0, MOST_SEED)
+            seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         elif self._seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         else:
@@ -554,11 +553,6 @@ def _check_actions(env: raw_env, agents: Sequence[str], actions: Any) -> None:
         if not isinstance(actions, Mapping) or agent not in actions:
             raise ValueError(f"actions: needs a dict with the action of {agent}")
         env.check_action(agent, actions[agent])
-
-
-def _true_or_false(name: str, value: bool) -> None:
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} = {shown(value)}: needs true or false")
 
 
 def _one_of(name: str, value: str, valid: Sequence[str]) -> None:

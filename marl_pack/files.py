@@ -162,7 +162,7 @@ class Growing(Generic[T]):
         self.next = 0.0  # when it may be written again
 
     def update(self, content: T) -> None:
-        """Take what there is now, and write it unless that has just been done."""
+        """Take the new content, and write it unless the file has just been written."""
         self.content = content
         if not self.at_end and time.monotonic() >= self.next:
             self.close()

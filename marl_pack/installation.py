@@ -30,15 +30,15 @@ class _Cache(FunctionCache):
 
 
 class _Uncached:
-    """The warning that compiled code is not cached, given once a process."""
+    """The warning that compiled code is not cached, once a process."""
 
-    given = False
+    warned = False
 
     @classmethod
     def warn(cls, reason: Exception) -> None:
         """Warn unless that was done before."""
-        if not cls.given:
-            cls.given = True
+        if not cls.warned:
+            cls.warned = True
             warnings.warn(
                 "compiled code cannot be cached, so each process compiles it again; set "
                 f"NUMBA_CACHE_DIR to a folder that may be written to ({reason})",

@@ -16,7 +16,7 @@ from rich.console import Console
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
-from marl_pack.checks import whole_number
+from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, add_arguments, given_options
 from marl_pack.geometry import Size
@@ -29,8 +29,6 @@ from marl_pack.items import (
     make_stream,
 )
 
-LARGEST_SEED = 2**64 - 1
-"""The largest seed; random numbers have 64 bits."""
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
 EPILOG = (

@@ -23,21 +23,10 @@ from rich.progress import (
 )
 from rich.text import Text
 
-LONGEST = 1000
-"""Number of characters of an error that are printed."""
+from marl_pack.checks import one_line, printable
+
 PIPED_WIDTH = 1000
 """Columns of output that is not a terminal's, so that no table is cut."""
-
-
-def printable(text: str) -> str:
-    """Return a text whose characters can all be printed, the others as escapes."""
-    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
-
-
-def one_line(message: object) -> str:
-    """Return a message as one line of printable characters, of limited length."""
-    text = printable(" ".join(str(message).split()))
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 class _PlainConsole(Console):
@@ -82,4 +71,4 @@ class Parser(argparse.ArgumentParser):
 
 def complain(program: str, error: object) -> None:
     """Print a program's error as one line."""
-    print(f"{program}: {one_line(error)}", file=sys.stderr)
+    print(f"{program}: {one_line(str(error))}", file=sys.stderr)

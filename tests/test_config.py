@@ -117,7 +117,8 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--ppo.symmetry=true", "--game.orientations=[0]"], r"ppo\.symmetry.*pairs"),
     (["--joint=true", "--game.mask_orientations=false"], r"mask_orientations.*always masked"),
     (["--ppo=null"], r"ppo"),
-    (["--seed=-1"], r"seed = -1: needs a number from 0 to 18,446,744,073,709,551,615$"),
+    (["--seed=-1"], r"^seed = -1: needs a number from 0 to 9,223,372,036,854,775,807$"),
+    ([f"--evaluation.seed={2**63}"], r"^evaluation\.seed = 9223372036854775808: needs a number"),
     (["--output.name=.."], r"output\.name"),
 ])  # fmt: skip
 def test_a_mistake_is_named_with_what_would_be_right(options: list[str], expected: str) -> None:

@@ -171,7 +171,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--json tests", "is a folder"),
         ("--device nowhere", "device 'nowhere'"),
         ("--device meta", "needs cpu, cuda"),
-        ("--seed -1", "--seed: needs a whole number from 0 to 18446744073709551615, not -1"),
+        ("--seed -1", "--seed: needs a whole number from 0 to 9223372036854775807, not -1"),
         ("--threads 0", "--threads: needs a whole number from 1 to 1024, not 0"),
         ("--threads 1000000", "from 1 to 1024, not 1000000"),
         ("--processes 1000000", "--processes: needs a whole number from 1 to 1024"),

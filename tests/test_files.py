@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -159,7 +158,7 @@ def interrupted_after(calls: int, function: Callable[..., object]) -> Callable[.
 
     def wrapper(*args: object, **named: object) -> object:
         if next(counter, None) is None:
-            signal.raise_signal(signal.SIGINT)
+            raise KeyboardInterrupt  # not a signal, which a job in the background may ignore
         return function(*args, **named)
 
     return wrapper

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from marl_pack.checks import shown
+from marl_pack.checks import LARGEST_SEED, shown
 from marl_pack.config.schema import Agent, Config
-from marl_pack.options import LARGEST_SEED, MOST_AT_ONCE
+from marl_pack.options import MOST_AT_ONCE
 
 
 class ConfigError(ValueError):

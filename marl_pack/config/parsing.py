@@ -16,7 +16,7 @@ import yaml
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
 from marl_pack import renamed
-from marl_pack.checks import shown
+from marl_pack.checks import TYPE_NAMES, one_line, shown
 from marl_pack.config.checks import ConfigError, check
 from marl_pack.config.schema import Config
 
@@ -118,7 +118,7 @@ def check_source(source: str, option: str) -> None:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text in UTF-8 ({error.reason})") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"{path}: not YAML: {one_line(str(error))}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(root, yaml.MappingNode):
@@ -174,11 +174,6 @@ def compose(text: str, name: str) -> yaml.Node | None:
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     counts: dict[int, int] = {}  # nodes below each node; 0 while they are counted
 
-    def children(node: yaml.Node) -> list[yaml.Node]:
-        if isinstance(node, yaml.MappingNode):
-            return [each for pair in node.value for each in pair]
-        return node.value if isinstance(node, yaml.SequenceNode) else []
-
     def count(node: yaml.Node) -> int:
         if id(node) not in counts:
             counts[id(node)] = 0
@@ -233,7 +228,7 @@ def _explained(parser: ArgumentParser) -> Iterator[None]:
     except ArgumentError as error:
         raise ConfigError(explain(parser, str(error))) from None
     except (ValueError, TypeError, OverflowError) as error:
-        raise ConfigError(" ".join(str(error).split())) from None
+        raise ConfigError(one_line(str(error))) from None
 
 
 def keys(parser: ArgumentParser) -> list[str]:
@@ -254,10 +249,7 @@ def _types(owner: type, prefix: str = "") -> dict[str, Any]:
 
 TYPES = _types(Config)
 """The type of every key."""
-WORDS = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
-    types.NoneType: "null", Any: "the name of a rule",
-}  # fmt: skip
+WORDS = TYPE_NAMES | {Any: "the name of a rule"}
 
 
 def in_words(key: str) -> str:
@@ -281,12 +273,12 @@ def _in_words(kind: Any) -> str:
 
 def explain(parser: ArgumentParser, message: str) -> str:
     """Return a message of the parser as what would be right, for an unknown key the valid ones."""
-    message = " ".join(message.split())
+    message = one_line(message)
     wrong = re.match(r'Parser key "([\w.]+)": ', message)
     if wrong is not None and wrong[1] in TYPES:
         value = re.search(r".*(?:Got|Given) value: (.*)$", message)
-        given = shown(value[1])[1:-1] if value else "a value"
-        return f"{wrong[1]} = {'null' if given == 'None' else given}: needs {in_words(wrong[1])}"
+        text = shown(value[1])[1:-1] if value else "a value"
+        return f"{wrong[1]} = {'null' if text == 'None' else text}: needs {in_words(wrong[1])}"
     inside = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
     beside = re.search(r"[Uu]nrecognized arguments: (.*)", message)
     alone = re.search(r"Option '([^']*)' is not accepted", message)

@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -25,7 +24,7 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
 from marl_pack.bins import UNKNOWN, Bins, check_device
-from marl_pack.checks import shown, whole_number
+from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game import invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides_tensor
 from marl_pack.game.spec import GameSpec, document
@@ -42,8 +41,6 @@ MOST_SKIPPED = 1000
 """Episodes in a row whose first item has no legal place, before the game gives up."""
 LAST_EPISODE = 2**62
 """The largest number of an episode."""
-MOST_SEED = 2**63 - 1
-"""Largest seed of a game; a search plays seeds below 0."""
 
 
 @document(" " * 8)
@@ -104,14 +101,12 @@ class Packing:
         first_episode: int = 0,
         **options: Any,
     ) -> None:
-        if not isinstance(auto_reset, bool | np.bool_):
-            raise ValueError(f"auto_reset = {shown(auto_reset)}: needs true or false")
         if not (spec is None or isinstance(spec, GameSpec)):
             raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
         options |= {} if bin is None else {"bin": bin}
         self.spec = (spec or GameSpec()).with_options(options)
         self.n = n = whole_number(n, "n, at least one game", 1, MOST_GAMES)
-        self.auto_reset = bool(auto_reset)
+        self.auto_reset = truth_value(auto_reset, "auto_reset")
         self.checked = invariants.wanted()
         self.device = check_device(device)
         self.backend = _backend_of(backend, self.device)
@@ -125,7 +120,7 @@ class Packing:
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
         self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
-        self.seed = whole_number(seed, "seed", 0, MOST_SEED)
+        self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.reset(first_episode=first_episode)
 
     def __copy__(self) -> Packing:
@@ -195,7 +190,7 @@ class Packing:
         most = self._most_items(self.stream.smallest, self.stream.longest)
         try:
             if seed is not None:
-                self.seed = whole_number(seed, "seed", 0, MOST_SEED)
+                self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
             first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
             self._start(self._games + first, most)
             if self.auto_reset if skip is None else skip:
@@ -322,7 +317,7 @@ class Packing:
             ValueError: if the numbers of games or episodes are impossible.
         """
         if not isinstance(games, Tensor) or games.dtype != torch.int64 or games.dim() != 1:
-            raise ValueError(f"games: needs int64 [K], numbers of games, not {_described(games)}")
+            raise ValueError(f"games: needs int64 [K], numbers of games, not {described(games)}")
         known = self.device.type == "cpu" and len(games) > 0  # another device would be waited for
         if known and not 0 <= int(games.min()) <= int(games.max()) < self.n:
             raise ValueError(f"games: needs numbers of games from 0 to {self.n - 1}")
@@ -335,7 +330,8 @@ class Packing:
             if not isinstance(episodes, Tensor) or episodes.shape != games.shape:
                 raise ValueError(f"episodes: a stream needs one for each of {len(games)} games")
             branched.stream = stream
-            branched.seed = whole_number(seed, "seed", -1 - MOST_SEED, MOST_SEED)
+            # A search plays negative seeds, which no user may give.
+            branched.seed = whole_number(seed, "seed", -1 - LARGEST_SEED, LARGEST_SEED)
             branched.orientation_sets = _orientation_sets(stream, self.spec)
             most = self._most_items(min(self.stream.smallest, stream.smallest), None)
             branched.state.bins = branched.bins.for_boxes(most)
@@ -387,9 +383,10 @@ class Packing:
             or choice.shape != (self.n,)
             or choice.device != self._games.device
         ):
+            where = f" on {choice.device}" if isinstance(choice, Tensor) else ""
             raise ValueError(
                 f"{what}: needs one whole number for each of {self.n} games, int64 [{self.n}] on "
-                f"{self._games.device}, not {_described(choice)}"
+                f"{self._games.device}, not {described(choice)}{where}"
             )
 
     def _check_orientations(self, orientation: Tensor) -> None:
@@ -564,10 +561,3 @@ def _backend_of(backend: Backend | None, device: torch.device) -> Backend:
     if backend is Backend.COMPILED and device.type != "cpu":
         raise ValueError(f"backend = {backend}: needs the device cpu, not {device}")
     return backend
-
-
-def _described(value: object) -> str:
-    """Return the type, shape and device of a value for a message."""
-    if not isinstance(value, Tensor):
-        return f"a {type(value).__name__}"
-    return f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)} on {value.device}"

@@ -16,10 +16,8 @@ from numbers import Integral
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-import numpy as np
-
 from marl_pack import renamed
-from marl_pack.checks import real_number, shown
+from marl_pack.checks import real_number, shown, truth_value
 from marl_pack.geometry import check_size
 from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import RULES, Rule, make_rule
@@ -104,12 +102,6 @@ def _orientations(value: Any) -> tuple[int, ...]:
     return tuple(sorted({int(o) for o in chosen}))
 
 
-def _switch(value: Any) -> bool:
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{shown(value)}: needs true or false")
-    return bool(value)
-
-
 def _max_items(value: Any) -> int | None:
     if value is not None and not (_is_whole(value) and 1 <= value <= MOST_ITEMS):
         raise ValueError(
@@ -160,7 +152,8 @@ class GameSpec:
     )  # fmt: skip
     mask_orientations: bool = _option(
         True, "whether orientations without a stable cell are excluded; else choosing one ends the "
-        "episode.", _switch, lambda masked: "" if masked else "no mask of orientations",
+        "episode.", lambda value: truth_value(value, "mask_orientations"),
+        lambda masked: "" if masked else "no mask of orientations",
         flag="orientation-mask", action=argparse.BooleanOptionalAction,
     )  # fmt: skip
     alpha: float = _option(

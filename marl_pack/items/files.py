@@ -1,7 +1,7 @@
 """Read item sequences from ``.npz``, ``.json`` and ``.csv`` files.
 
 The readers bring what a file contains into the arguments of
-:func:`marl_pack.items.sequences.check_items`, which checks it.
+:func:`marl_pack.items.checking.check_items`, which checks it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from marl_pack.checks import number_in, shown
 from marl_pack.inputs import read_arrays, read_json, read_lines
+from marl_pack.items.checking import Ragged, split_sequences
 from marl_pack.items.items import ATTRIBUTES, KEYS
 from marl_pack.items.names import check_names
-from marl_pack.items.sequences import Ragged, split_sequences
 
 SIDES = ("w", "d", "h")
 COLUMNS = (*SIDES, *(attribute.column for attribute in ATTRIBUTES), "sequence")

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from marl_pack.checks import whole_number
 from marl_pack.geometry import Size, check_size
+from marl_pack.items.checking import check_items
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import check_fields, read_fields
 from marl_pack.items.items import Items
-from marl_pack.items.sequences import Sequences, check_items
+from marl_pack.items.sequences import Sequences
 from marl_pack.items.streams import Cut, Stream, Uniform
 
 GENERATED = ("rs", "cut1", "cut2")

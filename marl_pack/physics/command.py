@@ -21,9 +21,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from marl_pack.checks import whole_number
+from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.files import Growing, check_writable, write_json
-from marl_pack.options import LARGEST_SEED, MOST_AT_ONCE
+from marl_pack.options import MOST_AT_ONCE
 from marl_pack.physics import controls, table1
 from marl_pack.physics.options import add_body_options, chosen_bodies
 from marl_pack.plan_archive import load_plans, save_plans

@@ -48,7 +48,7 @@ def in_order(task: Callable[[T], R], inputs: Iterable[T], processes: int) -> Ite
 
 
 def _follow(reader: Connection) -> None:
-    """Let this process end as soon as the other end of a pipe is closed."""
+    """End this process as soon as the other end of a pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits
 
     def end() -> None:

@@ -17,7 +17,6 @@ NEAR = 1e-6
 RESIDUAL = 1e-9
 """Largest sum of the equations' errors that is left to rounding."""
 
-
 SMALLEST_PIVOT = 1e-6
 """A division by less than this may blow up rounding errors, so float64 is not trusted then."""
 

@@ -36,13 +36,12 @@ from marl_pack.agents.learning.form import (
     check_alike,
     check_form,
     check_no_tensors,
-    described,
 )
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, ORIENTATION, PLACEMENT
 from marl_pack.agents.networks.planes import need_critic
 from marl_pack.agents.networks.trunk import Network
-from marl_pack.checks import shown, whole_number
+from marl_pack.checks import described, shown, whole_number
 from marl_pack.files import write_atomically
 
 FORMAT = 2

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack.checks import shown
+from marl_pack.checks import TYPE_NAMES, described, shown
 
 MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 18, 32, 4096
 """Limits of a file: number of its values, how deep they are nested, and a text's characters."""
@@ -23,10 +23,7 @@ LONGEST_NAME = 60
 LARGEST_WHOLE = 1 << 64
 """Whole numbers are smaller than this."""
 
-NAMES = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
-    Tensor: "a tensor", dict: "a mapping", list: "a list", type(None): "null",
-}  # fmt: skip
+NAMES = TYPE_NAMES | {Tensor: "a tensor", dict: "a mapping", list: "a list"}
 """What a value of a type is called in messages."""
 
 
@@ -165,13 +162,6 @@ def _check_type(value: Any, form: type | tuple[type, ...], where: str) -> None:
     if not any(type(value) in own.get(t, (t,)) for t in types):
         needs = " or ".join(NAMES[t] for t in types)
         raise ValueError(f"{where}: needs {needs}, not {described(value)}")
-
-
-def described(value: Any) -> str:
-    """Return a few words for a value: a tensor by its shape."""
-    if isinstance(value, Tensor):
-        return f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
-    return shown(value)
 
 
 def check_alike(value: Any, own: Any, where: str) -> None:

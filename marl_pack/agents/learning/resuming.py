@@ -13,6 +13,11 @@ from torch.optim import Optimizer
 from marl_pack.agents.learning.form import check_alike, check_keys
 from marl_pack.checks import real_number, shown
 
+NOT_NEGATIVE = ("step", "exp_avg_sq", "square_avg")
+"""Names of torch's moments and counters that are never negative."""
+TWISTER_WORDS = 624
+"""Number of words of the Mersenne twister's state."""
+
 
 def check_progress(checkpoint: Mapping[str, Any], items: int) -> None:
     """Refuse a checkpoint whose counters do not belong to one point of a run.
@@ -75,10 +80,6 @@ def checked_optimizer(
     return {"state": moments, "param_groups": groups}
 
 
-NOT_NEGATIVE = ("step", "exp_avg_sq", "square_avg")
-"""Names of torch's moments and counters that are never negative."""
-
-
 def _equal(value: Any, own: Any) -> bool:
     """Return whether two settings are equal and of one kind; a list is a tuple."""
     if isinstance(own, list | tuple):
@@ -105,10 +106,6 @@ def _after_a_step(optimizer: Optimizer, weight: Tensor) -> dict[str, Any]:
     }
 
 
-SIZE = 624
-"""Number of words of the Mersenne twister's state."""
-
-
 def check_generator(state: Tensor, where: str) -> None:
     """Refuse a state of torch's random generator on the CPU that points beyond its own words.
 
@@ -121,6 +118,7 @@ def check_generator(state: Tensor, where: str) -> None:
     content = state.cpu().numpy().tobytes()
     left, seeded = np.frombuffer(content, np.int32, 2, 8)
     following = int(np.frombuffer(content, np.uint64, 1, 16)[0])
-    fresh, running = (left, following) == (1, 0), 1 <= left <= SIZE and left + following == SIZE + 1
+    fresh = (left, following) == (1, 0)
+    running = 1 <= left <= TWISTER_WORDS and left + following == TWISTER_WORDS + 1
     if seeded != 1 or not (fresh or running):
         raise ValueError(f"{where}: no state of the random generator")

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from marl_pack import renamed
 from marl_pack.agents.layers import initialized
 from marl_pack.agents.networks.planes import PLANES, Observation, channel_names, input_channels
-from marl_pack.checks import shown, whole_number
+from marl_pack.checks import shown, truth_value, whole_number
 from marl_pack.geometry import MAX_SIDE
 
 MOST = {"channels": 4096, "layers": 128, "dilation": MAX_SIDE, "hidden": 65536}
@@ -55,8 +55,7 @@ class Network:
             value = getattr(self, name)
             whole_number(value, f"network: {name} = {shown(value)}", 1, most)
         for name in ("residual", "shortcut", "context", "share_trunk"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"network: {name} = {shown(getattr(self, name))}: true or false")
+            truth_value(getattr(self, name), f"network: {name}")
         if not isinstance(self.planes, list | tuple) or not all(
             isinstance(plane, str) for plane in self.planes
         ):
