@@ -1,11 +1,13 @@
 """ONNX files compute what PyTorch computes, for any batch and bin size."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from marl_pack import export
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -93,7 +95,7 @@ SMALL = (
 
 
 def test_the_command_writes_every_learned_agent(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = [*SMALL, f"--output.folder={tmp_path}", "--output.name=run",
                "--orientation.frozen=true", "--orientation.policy=first",
@@ -112,6 +114,11 @@ def test_the_command_writes_every_learned_agent(
     with pytest.raises(SystemExit):
         main([str(tmp_path / "nowhere")])
     assert "no such checkpoint" in capsys.readouterr().err
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(export, "export_agent", lambda *_: signal.raise_signal(signal.SIGINT))
+        main([str(tmp_path / "run")])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "python -m marl_pack.export: interrupted\n"
 
 
 def test_a_frozen_networks_own_critic_is_written_beside_the_runs(tmp_path: Path) -> None:

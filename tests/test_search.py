@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -241,6 +242,16 @@ def test_a_game_with_few_pairs_or_at_its_end_is_searched_too(agents: Agents) -> 
 def test_settings_that_cannot_be_read_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="plan"):
         SearchSettings.parse(text)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"rollouts": 1.5}, {"rollouts": True}, {"rollouts": "3"}, {"rollouts": None}, {"top": 2.0},
+    {"top": np.nan}, {"depth": 0}, {"depth": "1"},
+])  # fmt: skip
+def test_settings_are_whole_numbers(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=f"plan: {next(iter(wrong))}: needs a whole number >= 1"):
+        SearchSettings(**wrong)
+    assert str(SearchSettings(rollouts=np.int64(3))) == "plan rollouts=3,top=8"
 
 
 def test_settings_are_read_and_shown() -> None:
