@@ -24,7 +24,7 @@ from marl_pack.agents.policy import Policy
 from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
-from marl_pack.files import Growing, check_writable, write_json
+from marl_pack.files import Growing, check_writable, same_plain_file, write_json
 from marl_pack.options import EPILOG, MOST_AT_ONCE, Setup, add_options, choose, set_threads
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import save_plans
@@ -118,6 +118,9 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
             check_writable(path)
+    both = arguments.json, arguments.save_stacks
+    if None not in both and same_plain_file(*both):
+        raise ValueError(f"--json, --save-stacks: {arguments.json}: need two files")
     bodies = chosen_bodies(arguments) if arguments.physics else None
     if bodies is not None:
         load_sapien()  # if it is not installed, its error comes before the games

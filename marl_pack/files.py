@@ -71,6 +71,12 @@ def check_writable(path: Path) -> None:
         raise ValueError(f"{path}: the folder {folder} may not be written to")
 
 
+def same_plain_file(a: Path, b: Path) -> bool:
+    """Return whether two paths lead to one plain file, which may not exist yet."""
+    same = os.path.realpath(a) == os.path.realpath(b)
+    return same and not _written_through(a, _status(a))
+
+
 @contextmanager
 def moved_into_place(path: Path) -> Iterator[Path]:
     """Yield an empty temporary file with the same ending; move it into place at the end.

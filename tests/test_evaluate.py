@@ -175,6 +175,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--json nowhere/out.json", "does not exist"),
         ("--policy dblf random --save-stacks s.npz", "needs a single policy"),
         ("--json tests", "is a folder"),
+        ("--json new.json --save-stacks ./new.json", "--save-stacks: new.json: need two files"),
         ("--device nowhere", "device 'nowhere'"),
         ("--device meta", "needs cpu, cuda"),
         ("--seed -1", "--seed: needs a whole number from 0 to 18446744073709551615, not -1"),
