@@ -1,6 +1,5 @@
 """ONNX files compute what PyTorch computes, for any batch and bin size."""
 
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -114,8 +113,12 @@ def test_the_command_writes_every_learned_agent(
     with pytest.raises(SystemExit):
         main([str(tmp_path / "nowhere")])
     assert "no such checkpoint" in capsys.readouterr().err
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(export, "export_agent", lambda *_: signal.raise_signal(signal.SIGINT))
+        patch.setattr(export, "export_agent", interrupt)
         main([str(tmp_path / "run")])
     assert end.value.code == 130
     assert capsys.readouterr().err == "python -m marl_pack.export: interrupted\n"
