@@ -9,7 +9,11 @@ from torch import Tensor
 
 from marl_pack.agents import search
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.heuristics import (
+    make_orientation_agent,
+    make_placement_agent,
+    make_policy,
+)
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.policy import Policy, in_turns
@@ -281,3 +285,12 @@ def test_a_depth_needs_a_critic(agents: Agents) -> None:
         Planner(*agents, None, SearchSettings(depth=2), FUTURES)
     critic = make_critic("orientation", NETWORK, "cpu", agents[0].actor)
     Planner(*agents, critic, SearchSettings(depth=2), FUTURES)
+
+
+@pytest.mark.parametrize("seed", [1.5, True, "3", -1, 2**64, np.nan, torch.tensor(3)])
+def test_seeds_of_random_play_are_whole_numbers(seed: Any) -> None:
+    for make in (make_policy, make_orientation_agent, make_placement_agent):
+        with pytest.raises(ValueError, match="seed: needs a whole number from 0 to"):
+            make("random", seed)
+        make("random", np.int64(4))
+        make("random", None)
