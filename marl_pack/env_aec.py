@@ -38,7 +38,6 @@ Version history: v0, first release.
 
 from __future__ import annotations
 
-import copy
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
@@ -59,6 +58,7 @@ from pettingzoo.utils.conversions import (
 from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, document, with_options
+from marl_pack.game.state import Copied
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.plan import Plan
@@ -109,14 +109,6 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
     return (AtOnce if simultaneous else Turns)(env(**kwargs))
 
 
-class Copied:
-    """An environment whose copies continue exactly as it does, and share nothing that changes."""
-
-    def __copy__(self) -> Any:
-        """Return an independent copy: a view of the same game would not be one."""
-        return copy.deepcopy(self)
-
-
 class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
     """PettingZoo's outermost wrapper: it names calls in a wrong order, and wrong actions."""
 
@@ -142,8 +134,11 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
         Raises:
             ValueError: for an action that is no whole number of its action space.
         """
-        if action is not None and self._has_reset and self._raw.agents:
-            action = self._raw.check_action(self._raw.agent_selection, action)
+        raw = self._raw
+        if self._has_reset and raw.agents:
+            agent = raw.agent_selection
+            if action is not None or not (raw.terminations[agent] or raw.truncations[agent]):
+                action = raw.check_action(agent, action)
         super().step(action)
 
     def last(self, observe: bool = True) -> Any:
@@ -160,7 +155,7 @@ class AtOnce(Copied, aec_to_parallel_wrapper):
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Play one action of each agent."""
-        _check_actions(self.unwrapped, self.agents, actions)
+        _check_actions(self.unwrapped, self.unwrapped.agents, actions)
         return super().step(actions)
 
 
@@ -173,8 +168,8 @@ class Turns(Copied, turn_based_aec_to_parallel_wrapper):
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Play the acting agent's action; name the next one in every info."""
-        acting = [self.aec_env.agent_selection] if self.agents else []
-        _check_actions(self.unwrapped, acting, actions)
+        raw = self.unwrapped
+        _check_actions(raw, [raw.agent_selection] if raw.agents else [], actions)
         return self._name_active(*super().step(actions))
 
     def _name_active(self, *returned: Any) -> Any:
@@ -549,6 +544,8 @@ def _some_left(agents: Sequence[str]) -> None:
 
 def _check_actions(env: raw_env, agents: Sequence[str], actions: Any) -> None:
     """Raise ValueError unless the actions of ``agents`` are in a mapping, and in their spaces."""
+    if not hasattr(env, "agent_selection"):
+        raise ValueError("no episode has begun: begin one with reset()")
     for agent in agents:
         if not isinstance(actions, Mapping) or agent not in actions:
             raise ValueError(f"actions: needs a dict with the action of {agent}")

@@ -24,27 +24,51 @@ from marl_pack.agents.policy import Policy
 from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
-from marl_pack.files import Growing, check_writable, write_json
+from marl_pack.files import Growing, check_writable, same_plain_file, write_json
 from marl_pack.options import EPILOG, MOST_AT_ONCE, Setup, add_options, choose, set_threads
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, judge_all
 from marl_pack.sapien_check.world import SimulationError, load_sapien
-from marl_pack.terminal import Parser, make_console, make_progress
+from marl_pack.terminal import PIPED_WIDTH, Parser, make_console, make_progress
 
 EPISODES = 1000  # of a generated stream, unless --episodes is given
 
 
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
-    """Print the results as a table, a row for each policy."""
-    table = Table(title=title, box=box.SIMPLE, pad_edge=False, collapse_padding=True)
-    table.add_column("policy", overflow="fold")
+    """Print the results as a table, a row for each policy.
+
+    If their names are too long for the terminal, the table has numbers and the names stand below.
+    """
+    console.print(title, soft_wrap=True)
+    table = figures(rows, list(rows))
+    wide = console.options.update(width=PIPED_WIDTH)
+    if console.measure(table, options=wide).maximum <= console.width:
+        console.print(table)
+    else:
+        numbers = [f"({k})" for k in range(1, len(rows) + 1)]
+        console.print(figures(rows, numbers))
+        for number, name in zip(numbers, rows, strict=True):
+            console.print(f"{number} {name}", soft_wrap=True)
+    console.print(
+        f"±: 95 % interval of the mean, of {FEWEST} or more episodes;\n"
+        "dec./s: decisions (items placed) a second;\n"
+        "in equilibrium: final stacks in strict equilibrium as a whole"
+    )
+    if any("falls" in row for row in rows.values()):
+        console.print("falls: episodes in which something fell, in physics")
+
+
+def figures(rows: dict[str, dict[str, Any]], names: list[str]) -> Table:
+    """Return the table of results; ``names`` are what the rows are called in it."""
+    table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
+    table.add_column("policy", no_wrap=True)
     physics = any("falls" in row for row in rows.values())
     columns = ["episodes", "utilization %", "std", "items", "dec./s", "in equi-\nlibrium %"]
     for column in [*columns, "falls"] if physics else columns:
         table.add_column(column, justify="right", no_wrap=True)
-    for name, row in rows.items():
+    for name, row in zip(names, rows.values(), strict=True):
         table.add_row(
             name,
             str(row["episodes"]),
@@ -55,13 +79,7 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
             f"{100 * row['strict_equilibrium']:.2f}",
             *([falls_of(row)] if physics else []),
         )
-    console.print(table)
-    console.print(
-        f"±: 95 % interval of the mean, of {FEWEST} or more episodes;\n"
-        "dec./s: decisions (items placed) a second;\n"
-        "in equilibrium: final stacks in strict equilibrium as a whole"
-        + ("\nfalls: episodes in which something fell, in physics" if physics else "")
-    )
+    return table
 
 
 def falls_of(row: dict[str, Any]) -> str:
@@ -100,6 +118,9 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
             check_writable(path)
+    both = arguments.json, arguments.save_stacks
+    if None not in both and same_plain_file(*both):
+        raise ValueError(f"--json, --save-stacks: {arguments.json}: need two files")
     bodies = chosen_bodies(arguments) if arguments.physics else None
     if bodies is not None:
         load_sapien()  # if it is not installed, its error comes before the games
@@ -148,7 +169,8 @@ def evaluate_policy(
     if unplayable:
         console.print(
             f"{name}: {unplayable} episodes have a first item that may be placed "
-            "nowhere; they count as utilization 0"
+            "nowhere; they count as utilization 0",
+            soft_wrap=True,
         )
     if bodies is None:
         return
@@ -161,7 +183,7 @@ def evaluate_policy(
         yield row | falls(judged)
     unjudged = sum(verdict.error is not None for verdict in judged)
     if unjudged:
-        console.print(f"{name}: {unjudged} episodes without a verdict")
+        console.print(f"{name}: {unjudged} episodes without a verdict", soft_wrap=True)
 
 
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
@@ -185,17 +207,16 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     }  # fmt: skip
     growing = Growing(arguments.json, write_json)
     try:
-        with bar:
+        with growing, bar:
             for name, policy in setup.policies.items():
                 for row in evaluate_policy(name, policy, setup, episodes, bodies, bar):
                     rows[name] = row
                     growing.update(report)
-        report["complete"] = True
-        growing.update(report)
+            report["complete"] = True
+            growing.update(report)
     finally:
         if rows:
             show(rows, title, console)
-        growing.close()
     return rows
 
 

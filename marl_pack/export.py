@@ -188,6 +188,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
         run(chosen.checkpoint, chosen.folder, chosen.format, make_console())
+    except KeyboardInterrupt:
+        options.exit(130, f"{options.prog}: interrupted")
     except ModuleNotFoundError as error:
         options.exit(2, f"{options.prog}: {missing(error, 'ONNX needs two packages', 'export')}")
     except (ValueError, OSError) as error:

@@ -18,10 +18,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 T = TypeVar("T")
 
+DESCRIPTORS = "/dev/fd", "/proc/self/fd"  # folders of the files that a program has open
 PART = ".part-"  # what the names of unfinished files begin with
 WRITING = 0.05  # share of the time in which a growing file is written, at most
 
@@ -34,18 +35,21 @@ def _status(path: Path) -> os.stat_result | None:
         return None
 
 
-def _stream(status: os.stat_result) -> int | None:
+def _stream(path: Path, status: os.stat_result) -> int | None:
     """Return the descriptor of the program's own output that a file is, if it is one."""
-    for descriptor in (1, 2):
+    named = [int(path.name)] if str(path.parent) in DESCRIPTORS and path.name.isdecimal() else []
+    for descriptor in (1, 2, *named):
         with suppress(OSError):  # it may be closed
             if os.path.samestat(os.fstat(descriptor), status):
                 return descriptor
     return None
 
 
-def _written_through(status: os.stat_result | None) -> bool:
+def _written_through(path: Path, status: os.stat_result | None) -> bool:
     """Return whether a file is no plain file that could be replaced."""
-    return status is not None and not (stat.S_ISREG(status.st_mode) and _stream(status) is None)
+    return status is not None and not (
+        stat.S_ISREG(status.st_mode) and _stream(path, status) is None
+    )
 
 
 def check_writable(path: Path) -> None:
@@ -58,13 +62,19 @@ def check_writable(path: Path) -> None:
         raise ValueError(f"{path}: {error.strerror}") from None
     if status is not None and not os.access(path, os.W_OK):
         raise ValueError(f"{path}: may not be written to")
-    if _written_through(status):
+    if _written_through(path, status):
         return
     folder = Path(os.path.realpath(path)).parent
     if not folder.is_dir():
         raise ValueError(f"{path}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK):
         raise ValueError(f"{path}: the folder {folder} may not be written to")
+
+
+def same_plain_file(a: Path, b: Path) -> bool:
+    """Return whether two paths lead to one plain file, which may not exist yet."""
+    same = os.path.realpath(a) == os.path.realpath(b)
+    return same and not _written_through(a, _status(a))
 
 
 @contextmanager
@@ -78,7 +88,7 @@ def moved_into_place(path: Path) -> Iterator[Path]:
     """
     try:
         status = _status(path)
-        if _written_through(status):
+        if _written_through(path, status):
             with tempfile.TemporaryDirectory() as folder:
                 part = Path(folder, f"part{path.suffix}")
                 yield part
@@ -113,7 +123,7 @@ def _replacing(target: Path, status: os.stat_result | None) -> Iterator[Path]:
 
 def _write_through(path: Path, part: Path) -> None:
     """Copy a finished file into a device, a pipe or the program's own output."""
-    descriptor = _stream(path.stat())
+    descriptor = _stream(path, path.stat())
     for output in (sys.stdout, sys.stderr):
         output.flush()
     with part.open("rb") as file, open(
@@ -157,9 +167,15 @@ class Growing(Generic[T]):
 
     def __init__(self, path: Path | None, write: Callable[[Path, T], None]) -> None:
         self.path, self.write = path, write
-        self.at_end = path is not None and _written_through(_status(path))
+        self.at_end = path is not None and _written_through(path, _status(path))
         self.content: T | None = None  # that is not yet written
         self.next = 0.0  # when it may be written again
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def update(self, content: T) -> None:
         """Take the new content, and write it unless the file has just been written."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pickle import UnpicklingError
 from typing import Any
 
 import numba
@@ -11,13 +12,13 @@ from numba.core.caching import FunctionCache
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of one function; a full or unreadable disk does not stop the program."""
+    """Numba's cache of one function; a full disk or a damaged file does not stop the program."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled function; None if it is not there or cannot be read."""
         try:
             return super().load_overload(sig, target_context)
-        except OSError as error:
+        except (OSError, EOFError, UnpicklingError) as error:
             _Uncached.warn(error)
             return None
 
@@ -25,7 +26,7 @@ class _Cache(FunctionCache):
         """Write the compiled function if that is possible."""
         try:
             super().save_overload(sig, data)
-        except OSError as error:
+        except (OSError, EOFError, UnpicklingError) as error:
             _Uncached.warn(error)
 
 

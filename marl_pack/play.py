@@ -55,7 +55,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
         most = f" … {episodes - 1}" if episodes else " or more"
         raise ValueError(f"--episode {chosen.episode}: needs 0{most}")
     game = setup.game(1, chosen.episode)
-    table = Table(title=f"{name} plays {setup}, episode {chosen.episode}")
+    title = f"{name} plays {setup}, episode {chosen.episode}"
+    table = Table()
     for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
         table.add_column(column, justify="right")
     while bool(game.alive):
@@ -73,6 +74,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
             f"{float(outcome.reward):+.3f}",
             f"{float(outcome.utilization):.1%}",
         )
+    console.print(title, soft_wrap=True)
     console.print(table)
 
     from matplotlib.image import imsave
@@ -85,7 +87,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     console.print(ending)
     image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
     write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
-    console.print(f"picture: {chosen.picture}")
+    console.print(f"picture: {chosen.picture}", soft_wrap=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from functools import partial
 from typing import Any, NoReturn
 
 from rich.console import Console
@@ -61,8 +62,23 @@ def make_progress(console: Console) -> Progress:
     )  # fmt: skip
 
 
+def _decimal(kind: type[int] | type[float], text: str) -> float:
+    """Return the number that a text is in decimal notation."""
+    if "_" in text or not text.isascii():
+        raise ValueError
+    return kind(text)
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser of a command's options whose errors are one printable line."""
+    """A parser of a command's options whose errors are one printable line.
+
+    Numbers are decimal: Python's ``1_0`` is none.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        for kind in (int, float):
+            self.register("type", kind, partial(_decimal, kind))
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with a status and a message."""

@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.game.packing import Packing
+from marl_pack.game.state import Copied
 
 
-class PackingVecEnv(VecEnv):
+class PackingVecEnv(Copied, VecEnv):
     """G games with ``auto_reset`` behind the interface of rsl_rl's runner, one item a step.
 
     A step of the game has two turns. The runner sees the first one's observation; what the

@@ -88,6 +88,9 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--seed", "7", "5", "9"], r"^5 9: belongs to no key; a list is one word, such as"),
     (["--game.bin=[10,10,0]"], r"game: bin size \(10, 10, 0\)"),
     (["--ppo.gamma=1.5"], r"ppo\.gamma = 1\.5: needs a number from 0 to 1$"),
+    (["--ppo.learning_rate=1e38"], r"ppo\.learning_rate = 1e\+38: needs a positive number, 1e\+30"),
+    (["--game.alpha=1e300"], r"game: alpha = 1e\+300: needs a number from -1e9 to 1e9"),
+    (["--game.beta=-1e10"], r"game: beta = -10000000000\.0: needs a number from -1e9 to 1e9"),
     (["--ppo.learning_rate=.nan"], r"ppo\.learning_rate = nan: needs a positive"),
     (["--placement.entropy_coef=-1"], r"placement\.entropy_coef = -1\.0: needs a number from 0 to"),
     (["--ppo.num_envs=0"], r"ppo\.num_envs = 0: needs a number from 1 to"),
@@ -124,6 +127,20 @@ def test_settings_go_to_plain_values_and_back() -> None:
 def test_a_mistake_is_named_with_what_would_be_right(options: list[str], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
         parse(options)
+
+
+@pytest.mark.parametrize("number", ["1_0", "0x10", "0b1", "010", "1:30", "1_0.5", "1:30.5"])
+def test_numbers_are_decimal_in_files_and_on_the_command_line(number: str, tmp_path: Path) -> None:
+    path = tmp_path / "numbers.yaml"
+    for key, value in (
+        ("seed", number), ("game.margin", number), ("game.bin", f"[5, {number}, 5]"),
+        ("placement.learning_rate", number),
+    ):  # fmt: skip
+        path.write_text(as_yaml(key, value))
+        for option in (f"--config={path}", f"--{key}={value}"):
+            with pytest.raises(ConfigError, match=rf"{key} = '{number}': needs .*decimal notation"):
+                parse([option])
+    assert parse([f"--output.name={number}"])[0].output.name == number
 
 
 def test_a_typo_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

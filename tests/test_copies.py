@@ -14,6 +14,7 @@ from marl_pack import env_aec
 from marl_pack.backend import Backend
 from marl_pack.game import packing
 from marl_pack.game.packing import Packing
+from marl_pack.vec_env import PackingVecEnv
 
 COPIES: dict[str, Callable[[Any], Any]] = {
     "copy": copy.copy,
@@ -307,6 +308,19 @@ def test_games_that_were_played_without_gradients_are_copied() -> None:
     with torch.inference_mode():
         steps(game, 1)
     assert [steps(COPIES[name](game), 2) for name in COPIES] == [steps(game, 2)] * 3
+
+
+def heights(game: Packing) -> dict[str, torch.Tensor]:
+    return {"heightmap": game.bins.heightmap}
+
+
+@every_copy
+def test_a_copied_training_environment_plays_games_of_its_own(name: str) -> None:
+    env = PackingVecEnv(Packing(3, (4, 4, 5), seed=7, **SMALL), heights)
+    copied = COPIES[name](env)
+    assert steps(copied.game, 1) == steps(env.game, 1)
+    env.step(torch.stack(choices(env.game, np.random.default_rng(3)), 1))
+    assert not torch.equal(copied.get_observations()["heightmap"], heights(env.game)["heightmap"])
 
 
 def test_a_refused_reset_of_games_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,15 +88,18 @@ def test_weights_that_are_not_finite_are_refused_by_every_command_and_named(
 
 
 def test_a_run_whose_weights_end_up_not_finite_keeps_its_last_checkpoint(tmp_path: Path) -> None:
-    runner = make_runner(tiny(), tmp_path)
-
-    def spoil(progress: object) -> None:
-        runner.alg.learners["placement"].actor.mlp.scores.weight.data.fill_(NAN)
-
-    runner.show = spoil
-    with pytest.raises(TrainingDivergedError, match="placement/weights not finite"):
-        runner.train(1)
-    assert checkpoints.read(tmp_path / "latest.pt")["iter"] == -1
+    runner = make_runner(tiny("--placement.network.planes=[afterstate_value]"), tmp_path)
+    placement = runner.alg.learners["placement"].actor.mlp.scores.weight
+    for name, weight in (
+        ("afterstate_critic", next(runner.alg.afterstates.critic.parameters())),
+        ("placement", placement),
+    ):
+        runner.show = lambda progress, weight=weight: weight.data.fill_(NAN)
+        with pytest.raises(TrainingDivergedError, match=f"{name}/weights.* not finite"):
+            runner.train(1)
+        assert checkpoints.read(tmp_path / "latest.pt")["iter"] == -1
+        weight.data.fill_(0.1)
+        runner.current_learning_iteration = 0
 
 
 def changed_value(path: str, value: Any) -> Callable[[dict[str, Any]], None]:

@@ -373,10 +373,7 @@ def test_an_action_is_a_whole_number_of_its_space(kind: Any, action: Any, illega
     env = kind(illegal=illegal)
     env.reset(seed=0)
     before = env.state()
-    error, why = ValueError, "orientation_0: action: needs a whole number from 0 to 5"
-    if kind is env_aec.env and action is None:  # PettingZoo's own wrapper says it
-        error, why = AssertionError, "action is not in action space"
-    with pytest.raises(error, match=why):
+    with pytest.raises(ValueError, match="orientation_0: action: needs a whole number from 0 to 5"):
         env.step(action)
     assert (env.state() == before).all()
     assert env.agent_selection == O
@@ -394,6 +391,8 @@ def test_whole_numbers_of_every_type_are_actions(one: Any) -> None:
 def test_actions_of_a_parallel_step_are_checked_before_any_is_played() -> None:
     for simultaneous in (False, True):
         env = env_aec.parallel_env(simultaneous=simultaneous, illegal="repair")
+        with pytest.raises(ValueError, match="no episode has begun"):
+            env.step({O: 0, P: 0})
         env.reset(seed=0)
         before = env.state()
         for actions in ({}, 5, {P: 1}, {O: 0.5, P: 1}, {O: True, P: 1}):

@@ -1,3 +1,4 @@
+import io
 import json
 import re
 from dataclasses import replace
@@ -15,6 +16,7 @@ from marl_pack.evaluation.statistics import spread, strict_equilibrium, summary
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans
+from marl_pack.terminal import make_console
 
 
 def test_the_table_the_json_and_the_stacks_agree(
@@ -162,6 +164,10 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--items sr", "unknown items|no such file"),
         ("--episodes 0", "--episodes 0"),
         ("--margin -1", "margin"),
+        ("--seed 1_0", "--seed: invalid int value: '1_0'"),
+        ("--bin 10 10 1_0", "--bin: invalid int value: '1_0'"),
+        ("--alpha 1_0.5", "--alpha: invalid float value: '1_0.5'"),
+        ("--beta 1e300", "beta = 1e.300: needs a number from -1e9 to 1e9"),
         ("--thresholds code", "no parameter 'thresholds'"),
         ("--bin 10 10 0", "bin size"),
         ("--bin 4 4 4", "longest side"),
@@ -169,6 +175,7 @@ def test_all_heuristics_beat_random_play(tmp_path: Path) -> None:
         ("--json nowhere/out.json", "does not exist"),
         ("--policy dblf random --save-stacks s.npz", "needs a single policy"),
         ("--json tests", "is a folder"),
+        ("--json new.json --save-stacks ./new.json", "--save-stacks: new.json: need two files"),
         ("--device nowhere", "device 'nowhere'"),
         ("--device meta", "needs cpu, cuda"),
         ("--seed -1", "--seed: needs a whole number from 0 to 9223372036854775807, not -1"),
@@ -198,6 +205,23 @@ def test_more_episodes_than_a_file_has_are_refused(
         evaluate.main([*options, "--episodes", "2"])
     assert "1 … 1" in capsys.readouterr().err
     assert evaluate.main(options) == 0
+
+
+@pytest.mark.parametrize("length", [8, 40, 200])
+def test_a_policys_name_is_never_broken_however_narrow_the_terminal(length: int) -> None:
+    names = ["dblf", "n" * length]
+    row = {
+        "episodes": 1000, "utilization": 0.9, "interval": (0.8, 1.0), "std": 0.1, "packed": 20.0,
+        "decisions_per_second": 10_000.0, "strict_equilibrium": 1.0, "falls": 7,
+        "judged_episodes": 10,
+    }  # fmt: skip
+    output = io.StringIO()
+    console = make_console(file=output, force_terminal=True, width=80, color_system=None)
+    evaluate.show(dict.fromkeys(names, row), "a game", console)
+    lines = output.getvalue().splitlines()
+    for name in names:
+        assert sum(name in line for line in lines) == 1
+    assert sum("90.00 ± 10.00" in line and "7 of 10" in line for line in lines) == 2
 
 
 def test_a_single_episode_has_no_interval(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from marl_pack import export
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -93,7 +94,7 @@ SMALL = (
 
 
 def test_the_command_writes_every_learned_agent(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = [*SMALL, f"--output.folder={tmp_path}", "--output.name=run",
                "--orientation.frozen=true", "--orientation.policy=first",
@@ -112,6 +113,15 @@ def test_the_command_writes_every_learned_agent(
     with pytest.raises(SystemExit):
         main([str(tmp_path / "nowhere")])
     assert "no such checkpoint" in capsys.readouterr().err
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(export, "export_agent", interrupt)
+        main([str(tmp_path / "run")])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "python -m marl_pack.export: interrupted\n"
 
 
 def test_a_frozen_networks_own_critic_is_written_beside_the_runs(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from small_runs import small_disk
 from marl_pack import evaluate
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.files import Growing, check_writable, moved_into_place, write_json
-from marl_pack.physics import command, table1
+from marl_pack.physics import command, controls, table1
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans, save_plans
 from marl_pack.render.picture import save
@@ -149,6 +150,15 @@ def test_a_growing_file_is_written_at_once_and_a_pipe_once_at_the_end(tmp_path: 
     assert written == [[1, 2]]
 
 
+def test_a_descriptor_that_the_user_opened_is_written_through(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    with path.open("w") as log:
+        print("before", file=log, flush=True)
+        write_json(Path(f"/dev/fd/{log.fileno()}"), [1])
+        print("after", file=log)
+    assert path.read_text() == "before\n[\n  1\n]\nafter\n"
+
+
 # --- programs that are interrupted ----------------------------------------------------------------
 
 
@@ -212,6 +222,33 @@ def test_an_interrupted_judge_keeps_what_is_finished(
     assert len(load_plans(tmp_path / "falls_none.npz")) == row["falls"]
     program = "python -m marl_pack.sapien_check"
     assert capsys.readouterr().err.splitlines() == [f"{program}: interrupted"] * 2
+    with monkeypatch.context() as patch:
+        families = dict(islice(controls.FAMILIES.items(), 2))
+        patch.setattr(controls, "FAMILIES", families)
+        patch.setattr(controls, "STANDING", {})
+        for calls, name, judged in ((3, "outcome", 3), (1, "flips_at", 8)):
+            with monkeypatch.context() as inner:
+                inner.setattr(controls, name, interrupted_after(calls, getattr(controls, name)))
+                assert command.main(["controls", "--json", str(out)]) == 130
+            report = json.loads(out.read_text())
+            assert (report["complete"], len(report["controls"])) == (False, judged)
+            assert "judged right: " in capsys.readouterr().out
+
+
+def test_figures_are_written_though_nobody_reads_the_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.json"
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(evaluate, "show", full)
+    with pytest.raises(SystemExit):
+        evaluate.main(["--policy", "dblf", "random", "--episodes", "5", "--json", str(out)])
+    report = json.loads(out.read_text())
+    assert report["complete"] is True
+    assert len(report["policies"]) == 2
 
 
 WORKERS = """

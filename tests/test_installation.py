@@ -12,6 +12,7 @@ from marl_pack.installation import missing
 
 PACKAGE = Path(__file__).parent.parent / "marl_pack"
 
+DRAW = "print(draw(numpy.array([1], numpy.uint64), 10))"
 PLAY = """
 import marl_pack.env_aec
 from marl_pack.items.random_numbers import draw
@@ -37,6 +38,22 @@ def test_a_package_that_may_not_be_written_to_is_imported_with_one_warning(tmp_p
     assert str(copy) in result.stdout
     assert result.stderr.count("compiled code cannot be cached") == 1
     assert "set NUMBA_CACHE_DIR to a folder that may be written to" in result.stderr
+
+
+def test_a_damaged_cache_is_compiled_around(tmp_path: Path) -> None:
+    def play() -> str:
+        code = "from marl_pack.items.random_numbers import draw; import numpy; " + DRAW
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        return subprocess.check_output(
+            [sys.executable, "-c", code], cwd=PACKAGE.parent, env=environment, text=True,
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+
+    expected = play()
+    for ending, size in (("nbc", 20), ("nbi", 20), ("nbi", 0)):
+        (file,) = tmp_path.rglob(f"*.{ending}")
+        file.write_bytes(file.read_bytes()[:size])
+        assert play() == expected
 
 
 def test_a_missing_package_is_named_with_the_command_for_the_source() -> None:

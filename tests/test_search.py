@@ -2,13 +2,18 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from marl_pack.agents import search
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.heuristics import (
+    make_orientation_agent,
+    make_placement_agent,
+    make_policy,
+)
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.policy import Policy, in_turns
@@ -243,6 +248,16 @@ def test_settings_that_cannot_be_read_are_refused(text: str) -> None:
         SearchSettings.parse(text)
 
 
+@pytest.mark.parametrize("wrong", [
+    {"rollouts": 1.5}, {"rollouts": True}, {"rollouts": "3"}, {"rollouts": None}, {"top": 2.0},
+    {"top": np.nan}, {"depth": 0}, {"depth": "1"},
+])  # fmt: skip
+def test_settings_are_whole_numbers(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=f"plan: {next(iter(wrong))}: needs a whole number >= 1"):
+        SearchSettings(**wrong)
+    assert str(SearchSettings(rollouts=np.int64(3))) == "plan rollouts=3,top=8"
+
+
 def test_settings_are_read_and_shown() -> None:
     assert SearchSettings.parse("rollouts=3, top=2") == SearchSettings(3, 2)
     assert str(SearchSettings.parse("top=2,depth=4")) == "plan rollouts=16,top=2,depth=4"
@@ -270,3 +285,12 @@ def test_a_depth_needs_a_critic(agents: Agents) -> None:
         Planner(*agents, None, SearchSettings(depth=2), FUTURES)
     critic = make_critic("orientation", NETWORK, "cpu", agents[0].actor)
     Planner(*agents, critic, SearchSettings(depth=2), FUTURES)
+
+
+@pytest.mark.parametrize("seed", [1.5, True, "3", -1, 2**64, np.nan, torch.tensor(3)])
+def test_seeds_of_random_play_are_whole_numbers(seed: Any) -> None:
+    for make in (make_policy, make_orientation_agent, make_placement_agent):
+        with pytest.raises(ValueError, match="seed: needs a whole number from 0 to"):
+            make("random", seed)
+        make("random", np.int64(4))
+        make("random", None)

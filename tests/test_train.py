@@ -327,7 +327,8 @@ def test_a_run_is_trained_by_one_process_and_resumed_with_its_own_record(
     errors = capsys.readouterr().err.splitlines()
     program = "python -m marl_pack.train"
     assert errors == [f"{program}: {run}: another process trains this run; wait for its end"]
-    for content in (b"", b"{", b"[]", b"\xff", b'{"arguments": 3}', b"[" * 100_000):
+    for content in (b"", b"{", b"[]", b"\xff", b'{"arguments": 3}', b"[" * 100_000,
+                    b'{"arguments": [], "seed": 1e999}'):  # fmt: skip
         (run / "run.json").write_bytes(content)
         assert main(more) == 2
         (error,) = capsys.readouterr().err.splitlines()

@@ -24,9 +24,9 @@ from marl_pack.agents.policy import (
     draw,
     in_turns,
 )
-from marl_pack.checks import shown
+from marl_pack.checks import shown, whole_number
 from marl_pack.game.moves import Moves
-from marl_pack.game.packing import Packing
+from marl_pack.game.packing import MOST_SEED, Packing
 from marl_pack.geometry import resting_heights_and_waste
 
 Keys = Sequence[tuple[Tensor, int]]
@@ -172,7 +172,7 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
         device: of the games.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: for an unknown name or an impossible seed.
     """
     if not isinstance(name, str) or name not in POLICIES:
         raise _unknown("policy", name, POLICIES)
@@ -240,4 +240,6 @@ def _unknown(kind: str, name: str, names: Sequence[str]) -> ValueError:
 
 
 def _generator(seed: int | None, device: torch.device | str) -> torch.Generator | None:
-    return None if seed is None else torch.Generator(device).manual_seed(seed % 2**63)
+    if seed is None:
+        return None
+    return torch.Generator(device).manual_seed(whole_number(seed, "seed", 0, MOST_SEED))

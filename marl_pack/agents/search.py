@@ -20,6 +20,7 @@ from torch import Tensor
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import Critic
 from marl_pack.agents.policy import Placement
+from marl_pack.checks import whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.items import Stream
@@ -46,10 +47,9 @@ class SearchSettings:
     depth: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rollouts", "top", "depth"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"plan: {name} = {value}, needs 1 or more")
+        for name, value in vars(self).items():
+            if not (value is None and name == "depth"):
+                object.__setattr__(self, name, whole_number(value, f"plan: {name}", 1))
         if self.rollouts * self.top > MOST:
             raise ValueError(f"plan: rollouts · top = {self.rollouts * self.top}, at most {MOST:,}")
 

@@ -31,6 +31,7 @@ class Range(NamedTuple):
 
 
 MANY, SEEDS, SHARE = Range(1, 10**9), Range(0, LARGEST_SEED), Range(0, 1)
+FASTEST = 1e30  # learning rate; optimisers divide it, and float32 ends at 3e38
 POSITIVE, NOT_NEGATIVE = Range(0, 1e38, open=True), Range(0, 1e38)
 RANGES = {
     "seed": SEEDS,
@@ -46,7 +47,7 @@ RANGES = {
     "ppo.value_loss_coef": NOT_NEGATIVE,
     "ppo.entropy_coef": NOT_NEGATIVE,
     "ppo.final_entropy_coef": NOT_NEGATIVE,
-    "ppo.learning_rate": POSITIVE,
+    "ppo.learning_rate": Range(0, FASTEST, open=True),
     "ppo.desired_kl": POSITIVE,
     "ppo.max_grad_norm": POSITIVE,
     "evaluation.every": Range(0, 10**9),
@@ -57,8 +58,9 @@ RANGES = {
     **{
         f"{agent}.{key}": NOT_NEGATIVE
         for agent in ("orientation", "placement")
-        for key in ("learning_rate", "entropy_coef", "final_entropy_coef")
+        for key in ("entropy_coef", "final_entropy_coef")
     },
+    **{f"{agent}.learning_rate": Range(0, FASTEST) for agent in ("orientation", "placement")},
 }
 """The numbers that each setting may be; those of the game and of networks check themselves."""
 

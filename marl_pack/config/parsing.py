@@ -26,6 +26,8 @@ LONGEST_VALUE = 4096
 """Most characters of one value, as of a path."""
 DEEPEST = 20
 """Most levels of lists and sections in settings, far more than there are."""
+NOT_DECIMAL = re.compile(r"[-+]?(0[\dxob]|\d[\d.]*[_:])")
+"""Numbers that YAML reads in another notation than the decimal one."""
 MOST_NODES = 10_000
 """Most values in settings, those counted that anchors repeat."""
 
@@ -82,7 +84,7 @@ def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[tuple[st
         files: options whose values may be files of settings.
 
     Raises:
-        ConfigError: for a value that is too deep or too large.
+        ConfigError: for a value that is too deep or too large, or a number in another notation.
     """
     for before, word in pairwise(("", *words)):
         option, equals, value = word.partition("=")
@@ -91,7 +93,7 @@ def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[tuple[st
             yield option, value
         else:
             with contextlib.suppress(yaml.YAMLError):  # a text that is no YAML
-                compose(value, option)
+                check_numbers(compose(value, option), option.removeprefix("--"))
 
 
 def check_source(source: str, option: str) -> None:
@@ -143,15 +145,33 @@ def check_source(source: str, option: str) -> None:
                 check_section(value, f"{key}.")
             elif key in own:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
-            elif key in TYPES and str not in (TYPES[key], *get_args(TYPES[key])):
-                check_quotes(value, key, where)
-
-    def check_quotes(value: yaml.Node, key: str, where: str) -> None:
-        for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-            if getattr(node, "style", None) in ("'", '"') and WORDS.get(TYPES[key]) != WORDS[Any]:
-                raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without quotes")
+            else:
+                check_numbers(value, key, f"{where}: ")
 
     check_section(root, "")
+
+
+def check_numbers(value: yaml.Node | None, key: str, where: str = "") -> None:
+    """Refuse numbers in quotes, and those that YAML reads as others, such as 1_0, 010 and 1:30.
+
+    Args:
+        value: of the key, or a list of values.
+        key: it may be any; those of texts are not checked.
+        where: the file and line, if it stands in a file.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    kind = TYPES.get(key, str)
+    if kind is Any or str in (kind, *get_args(kind)):
+        return
+    for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+        if where and getattr(node, "style", None) in ("'", '"'):
+            raise ConfigError(f"{where}{key}: needs {in_words(key)}, without quotes")
+        if isinstance(node, yaml.ScalarNode) and NOT_DECIMAL.match(node.value):
+            raise ConfigError(
+                f"{where}{key} = {shown(node.value)}: needs {in_words(key)}, in decimal notation"
+            )
 
 
 def compose(text: str, name: str) -> yaml.Node | None:

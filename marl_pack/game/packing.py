@@ -28,7 +28,7 @@ from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_
 from marl_pack.game import invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides_tensor
 from marl_pack.game.spec import GameSpec, document
-from marl_pack.game.state import GameState, refuse_where
+from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
 from marl_pack.items.items import ALL_ORIENTATIONS
@@ -44,7 +44,7 @@ LAST_EPISODE = 2**62
 
 
 @document(" " * 8)
-class Packing:
+class Packing(Copied):
     """G games, each with one bin and its own conveyor.
 
     An episode whose first item has no legal cell in the empty bin is over before it begins: it is
@@ -122,10 +122,6 @@ class Packing:
         self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
         self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.reset(first_episode=first_episode)
-
-    def __copy__(self) -> Packing:
-        """Return games that continue exactly as these do; only the item stream is shared."""
-        return copy.deepcopy(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Packing:
         """Return games that continue exactly as these do; only the item stream is shared."""

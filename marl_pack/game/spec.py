@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral
 from types import MappingProxyType
@@ -59,6 +59,10 @@ MOST_ITEMS = 2**31 - 1
 """Largest number of items that a bin may be limited to."""
 
 
+LARGEST_WEIGHT = 1e9
+"""Largest weight of a part of the reward, so that squares of returns stay within float32."""
+
+
 def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
@@ -70,6 +74,12 @@ def _number(value: Any) -> float:
         raise ValueError(f"{shown(value)}: needs a finite number") from None
 
 
+def _reward_weight(value: Any) -> float:
+    if abs(_number(value)) > LARGEST_WEIGHT:
+        raise ValueError(f"{shown(value)}: needs a number from -1e9 to 1e9")
+    return float(value)
+
+
 def _margin(value: Any) -> float | None:
     if value is not None and _number(value) < 0:
         raise ValueError(f"{value!r}: needs a number of cells ≥ 0")
@@ -79,7 +89,10 @@ def _margin(value: Any) -> float | None:
 def _listed(value: Any) -> list[Any]:
     """Return the values in a list, tuple, set or array; none for texts, bytes and mappings."""
     no_list = (str, bytes, bytearray, Mapping)
-    return list(value) if isinstance(value, Iterable) and not isinstance(value, no_list) else []
+    try:
+        return [] if isinstance(value, no_list) else list(value)
+    except TypeError:  # a single value, as in an array without axes
+        return []
 
 
 def _com_offset(value: Any) -> tuple[float, float, float]:
@@ -157,11 +170,11 @@ class GameSpec:
         flag="orientation-mask", action=argparse.BooleanOptionalAction,
     )  # fmt: skip
     alpha: float = _option(
-        1.0, "weight of the volume gained in the reward (Eq. 5).", _number,
+        1.0, "weight of the volume gained in the reward (Eq. 5).", _reward_weight,
         lambda alpha: f"alpha {alpha:g}", type=float,
     )  # fmt: skip
     beta: float = _option(
-        1.0, "weight of the space wasted in the reward (Eq. 5).", _number,
+        1.0, "weight of the space wasted in the reward (Eq. 5).", _reward_weight,
         lambda beta: f"beta {beta:g}", type=float,
     )  # fmt: skip
     com_offset: tuple[float, float, float] = _option(

@@ -7,9 +7,10 @@ the paper has k = 1 and b = 1, so the tensors here have no axis for them: the vi
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -18,6 +19,14 @@ from marl_pack.bins import UNKNOWN, Bins, empty, place
 from marl_pack.checks import shown
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items.items import Items
+
+
+class Copied:
+    """What copies continue exactly as it does, and share nothing that changes."""
+
+    def __copy__(self) -> Self:
+        """Return an independent copy: a view of the same game would not be one."""
+        return copy.deepcopy(self)
 
 
 @dataclass

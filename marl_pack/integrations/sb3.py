@@ -12,10 +12,11 @@ from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPo
 from torch import Tensor
 
 from marl_pack.env_aec import AGENTS
+from marl_pack.game.state import Copied
 from marl_pack.integrations.network import ActorCritic
 
 
-class Turns(gymnasium.Env[Any, Any]):
+class Turns(Copied, gymnasium.Env[Any, Any]):
     """A Gymnasium environment whose single agent plays both turns for the shared reward.
 
     Args:
@@ -38,7 +39,7 @@ class Turns(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         """Play the turn of the agent that acts; return what gymnasium's ``step`` does."""
         agent = self.env.agent_selection
-        self.env.step(int(action))
+        self.env.step(action)
         ends = self.env.terminations[agent], self.env.truncations[agent]
         observation = self.env.observe(self.env.agent_selection)
         return observation, self.env.rewards[agent], *ends, dict(self.env.infos[agent])

@@ -54,18 +54,17 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
     }  # fmt: skip
     growing = Growing(options.json, write_json)
     try:
-        with make_progress(console) as bar:
+        with growing, make_progress(console) as bar:
             for rule in rules:
                 for row in judged_rule(rule, options, bar):
                     rows[rule] = row
                     growing.update(report)
-        report["complete"] = True
-        growing.update(report)
+            report["complete"] = True
+            growing.update(report)
     finally:
         if rows:
             title = f"Table 1, {options.objects:,} objects a rule, seed {options.seed}"
             show_table1(rows, console, title)
-        growing.close()
 
 
 def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterator[dict[str, Any]]:
@@ -132,44 +131,51 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
 def run_controls(options: argparse.Namespace, console: Console) -> bool:
     """Judge the controls, print them, and return whether all were judged right."""
     cases = controls.cases()
-    with make_progress(console) as bar:
-        task = bar.add_task("controls", total=len(cases))
-        outcomes = []
-        for name, margin, plan in cases:
-            outcomes.append(controls.outcome(name, margin, plan, options.physics))
-            bar.advance(task)
-        task = bar.add_task("margins", total=len(controls.FAMILIES))
-        flips = {}
-        for name, make in controls.FAMILIES.items():
-            flips[name] = controls.flips_at(make, options.physics)
-            bar.advance(task)
-    right = {of: sum(getattr(o, of) == o.known for o in outcomes)
-             for of in ("judge", "equilibrium", "everything")}  # fmt: skip
-    show_controls(outcomes, flips, right, console)
-    report = {
+    outcomes: list[controls.Outcome] = []
+    flips: dict[str, float] = {}
+    growing = Growing(options.json, write_json)
+    try:
+        with growing, make_progress(console) as bar:
+            task = bar.add_task("controls", total=len(cases))
+            for name, margin, plan in cases:
+                outcomes.append(controls.outcome(name, margin, plan, options.physics))
+                growing.update(controls_report(outcomes, flips, options))
+                bar.advance(task)
+            task = bar.add_task("margins", total=len(controls.FAMILIES))
+            for name, make in controls.FAMILIES.items():
+                flips[name] = controls.flips_at(make, options.physics)
+                growing.update(controls_report(outcomes, flips, options))
+                bar.advance(task)
+    finally:
+        if outcomes:
+            show_controls(outcomes, flips, console)
+    return all(o.judge == o.known for o in outcomes)
+
+
+def controls_report(
+    outcomes: list[controls.Outcome], flips: dict[str, float], options: argparse.Namespace
+) -> dict[str, Any]:
+    """Return the figures of the controls that have been judged."""
+    return {
+        "complete": len(flips) == len(controls.FAMILIES),
         "controls": [asdict(o) for o in outcomes],
         "flips_at_mm": {name: None if math.isnan(at) else at for name, at in flips.items()},
         "physics": asdict(options.physics),
     }
-    if options.json is not None:
-        write_json(options.json, report)
-    return right["judge"] == len(outcomes)
 
 
 def show_controls(
-    outcomes: list[controls.Outcome],
-    flips: dict[str, float],
-    right: dict[str, int],
-    console: Console,
+    outcomes: list[controls.Outcome], flips: dict[str, float], console: Console
 ) -> None:
     """Print a row for each stack, with its verdicts at all margins.
 
     Args:
-        outcomes: of all controls.
+        outcomes: of the controls that have been judged.
         flips: name of a family -> margin in millimetres at which the verdict flips.
-        right: field of an outcome -> how many are as known.
         console: where to print.
     """
+    right = {of: sum(getattr(o, of) == o.known for o in outcomes)
+             for of in ("judge", "equilibrium", "everything")}  # fmt: skip
     table = Table(title="controls: + stands, - falls", box=box.SIMPLE, pad_edge=False)
     table.add_column("stack", no_wrap=True)
     for column in ("known", "judge", "exact", "all meet", "flips, mm"):
@@ -213,7 +219,7 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     judged: dict[int, Judged] = {}
     growing = Growing(options.json, write_json)
     try:
-        with make_progress(console) as bar:
+        with growing, make_progress(console) as bar:
             task = bar.add_task("episodes", total=len(chosen))
             stacks = bodies.stacks(plans, chosen)
             verdicts = judge_all(stacks, options.physics, options.processes)
@@ -224,7 +230,6 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     finally:
         if judged:
             show_judged(judged, console)
-        growing.close()
 
 
 def stack_report(

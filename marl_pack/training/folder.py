@@ -75,6 +75,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
+        json.dumps(record, allow_nan=False)  # it will be written again
         if isinstance(record["arguments"], list) and isinstance(record.get("resumed", []), list):
             return dict(record)
     except (ValueError, TypeError, KeyError, RecursionError):

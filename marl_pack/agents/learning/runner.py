@@ -132,16 +132,16 @@ class Runner(OnPolicyRunner):
 
     def _agents_with_weights_not_finite(self) -> list[str]:
         """Return the weights that are not finite, as ``name/weights`` of their learners."""
+        weights = {
+            name: [*ppo.actor.parameters(), *ppo.critic.parameters()]
+            for name, ppo in self.alg.learners.items()
+        }
+        if self.alg.afterstates is not None:
+            weights["afterstate_critic"] = list(self.alg.afterstates.critic.parameters())
         return [
             f"{name}/weights"
-            for name, ppo in self.alg.learners.items()
-            if not torch.stack(
-                [
-                    weight.isfinite().all()
-                    for network in (ppo.actor, ppo.critic)
-                    for weight in network.parameters()
-                ]
-            ).all()
+            for name, own in weights.items()
+            if not torch.stack([weight.isfinite().all() for weight in own]).all()
         ]
 
     def _write_latest(self) -> None:
