@@ -30,6 +30,18 @@ MOST_NODES = 10_000
 """Most values in settings, those counted that anchors repeat."""
 
 
+YAML = "tag:yaml.org,2002:"
+NULL_TAG = f"{YAML}null"
+KEY_TAGS = (f"{YAML}str", f"{YAML}merge")
+"""Tags of the names of keys, and of ``<<``."""
+VALUE_TAGS = [
+    f"{YAML}{kind}" for kind in ["null", "bool", "int", "float", "str", "seq", "map", "timestamp"]
+]
+"""Tags of values, as they follow from what is written."""
+NULLS = (None, "null", "Null", "NULL", "~")
+"""What stands for no value; on the command line a text may be any of them."""
+
+
 def make_parser() -> ArgumentParser:
     """Return the options of ``python -m marl_pack.train``: every key of :class:`Config`."""
     parser = ArgumentParser(
@@ -129,7 +141,7 @@ def check_source(source: str, option: str) -> None:
         names = set()
         for name, value in node.value:
             where = f"{path}, line {name.start_mark.line + 1}"
-            if not isinstance(name, yaml.ScalarNode):
+            if name.tag not in KEY_TAGS:
                 raise ConfigError(f"{where}: needs the name of a key")
             key = f"{prefix}{name.value}"
             if key in names:
@@ -143,12 +155,21 @@ def check_source(source: str, option: str) -> None:
                 check_section(value, f"{key}.")
             elif key in own:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
-            elif key in TYPES and str not in (TYPES[key], *get_args(TYPES[key])):
-                check_quotes(value, key, where)
+            elif key in TYPES:
+                check_value(value, key, where)
 
-    def check_quotes(value: yaml.Node, key: str, where: str) -> None:
+    def check_value(value: yaml.Node, key: str, where: str) -> None:
+        if value.tag == NULL_TAG and not may_be_null(key):
+            raise ConfigError(f"{key} = null: needs {in_words(key)}")
+        text = str in (TYPES[key], *get_args(TYPES[key]))
         for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-            if getattr(node, "style", None) in ("'", '"') and WORDS.get(TYPES[key]) != WORDS[Any]:
+            if node.tag not in VALUE_TAGS:
+                raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without a tag")
+            if (
+                not text
+                and getattr(node, "style", None) in ("'", '"')
+                and WORDS.get(TYPES[key]) != WORDS[Any]
+            ):
                 raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without quotes")
 
     check_section(root, "")
@@ -200,9 +221,11 @@ def compose(text: str, name: str) -> yaml.Node | None:
 
 def build(parser: ArgumentParser, options: Namespace) -> Config:
     """Return the checked :class:`Config` of parsed options."""
-    for key, kind in TYPES.items():
-        if options[key] is None and type(None) not in get_args(kind):
+    for key in TYPES:
+        if options[key] in NULLS and not may_be_null(key):
             raise ConfigError(f"{key} = null: needs {in_words(key)}")
+        if options[key] == "":
+            raise ConfigError(f"{key} = '': needs {in_words(key)}")
     built = parser.instantiate(options)
     config = Config(**{name: built[name] for name in Config.__dataclass_fields__})
     check(config)
@@ -258,6 +281,11 @@ WORDS = {
     bool: "true or false", int: "a whole number", float: "a number", str: "a text",
     types.NoneType: "null", Any: "the name of a rule",
 }  # fmt: skip
+
+
+def may_be_null(key: str) -> bool:
+    """Return whether a key may have no value."""
+    return type(None) in get_args(TYPES[key])
 
 
 def in_words(key: str) -> str:
