@@ -49,9 +49,10 @@ def real_number(value: Any, what: str) -> float:
     Raises:
         ValueError: naming the value and what it needs to be.
     """
+    decimal = str(value) if isinstance(value, np.floating) else value
     if not isinstance(value, bool) and isinstance(value, Real):
         try:
-            number = float(str(value) if isinstance(value, np.floating) else value)
+            number = float(decimal)
         except OverflowError:  # an int beyond float64
             number = math.inf
         if isinstance(value, Fraction) and math.isfinite(number) and Fraction(str(number)) != value:

@@ -34,10 +34,9 @@ YAML = "tag:yaml.org,2002:"
 NULL_TAG = f"{YAML}null"
 KEY_TAGS = (f"{YAML}str", f"{YAML}merge")
 """Tags of the names of keys, and of ``<<``."""
-VALUE_TAGS = [
-    f"{YAML}{kind}" for kind in ["null", "bool", "int", "float", "str", "seq", "map", "timestamp"]
-]
-"""Tags of values, as they follow from what is written."""
+KINDS = ("bool", "float", "int", "null", "seq", "str", "timestamp")
+VALUE_TAGS = {f"{YAML}{kind}" for kind in KINDS}
+"""Tags of values that follow from how they are written."""
 NULLS = (None, "null", "Null", "NULL", "~")
 """What stands for no value; on the command line a text may be any of them."""
 
@@ -165,11 +164,8 @@ def check_source(source: str, option: str) -> None:
         for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
             if node.tag not in VALUE_TAGS:
                 raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without a tag")
-            if (
-                not text
-                and getattr(node, "style", None) in ("'", '"')
-                and WORDS.get(TYPES[key]) != WORDS[Any]
-            ):
+            quoted = getattr(node, "style", None) in ("'", '"')
+            if quoted and not text and WORDS.get(TYPES[key]) != WORDS[Any]:
                 raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without quotes")
 
     check_section(root, "")
