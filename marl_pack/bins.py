@@ -164,6 +164,9 @@ def check_device(device: torch.device | str) -> torch.device:
     """
     try:
         checked = torch.device(device)
+    except RuntimeError:  # its text lists two dozen kinds of devices
+        checked = torch.device("meta")
+    try:
         if checked.type not in ("cpu", "cuda"):
             raise ValueError("needs cpu, cuda or cuda:N")
         torch.empty(0, device=checked)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from functools import lru_cache
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 DECIMAL = frozenset("0123456789+-.eE")
 """Characters of a number in decimal notation."""
@@ -64,6 +66,8 @@ def whole_number(value: Any, what: str, low: int, high: int | None = None) -> in
 def real_number(value: Any, what: str) -> float:
     """Return a finite number as a float: a Python or NumPy number, no bool or text.
 
+    A NumPy number of any width means the decimal that it shows as, as a float does.
+
     Args:
         value: to check.
         what: names the value, for the message.
@@ -71,14 +75,24 @@ def real_number(value: Any, what: str) -> float:
     Raises:
         ValueError: naming the value and what it needs to be.
     """
+    decimal = str(value) if isinstance(value, np.floating) else value
     if not isinstance(value, bool) and isinstance(value, Real):
         try:
-            number = float(value)
+            number = float(decimal)
         except OverflowError:  # an int beyond float64
             number = math.inf
+        if isinstance(value, Fraction) and math.isfinite(number) and Fraction(str(number)) != value:
+            raise ValueError(f"{what}: needs a decimal number, not {shown(value)}")
         if math.isfinite(number):
             return number
     raise ValueError(f"{what}: needs a finite number, not {shown(value)}")
+
+
+def decimals(numbers: NDArray[Any]) -> NDArray[np.float64]:
+    """Return numbers of any width as float64; each means the decimal that it shows as."""
+    if numbers.dtype.kind == "f" and numbers.dtype != np.float64:
+        numbers = numbers.astype(str)
+    return numbers.astype(np.float64)
 
 
 @lru_cache(maxsize=1 << 14)  # the cells of a table repeat

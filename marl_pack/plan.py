@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.bins import Bins
-from marl_pack.checks import number_in, real_number, whole_number
+from marl_pack.checks import decimals, number_in, real_number, whole_number
 from marl_pack.files import write_atomically, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
@@ -82,7 +82,7 @@ class Plan:
         for key, array in arrays.items():
             if kinds.get(key) is np.int64 and array.dtype.kind == "f" and array.size:
                 raise ValueError(f"{key}: needs whole numbers")
-            array = array.astype(kinds.get(key, np.float64))
+            array = array.astype(np.int64) if kinds.get(key) is np.int64 else decimals(array)
             array.flags.writeable = False
             object.__setattr__(self, key, array)
         object.__setattr__(self, "ids", tuple(self.ids))
@@ -151,7 +151,7 @@ class Plan:
         if loads is None:
             volumes = sides.astype(np.float64).prod(1)
             loads = np.column_stack((volumes, low[:, :2] + sides[:, :2] / 2))
-        loads = np.asarray(loads, np.float64).reshape(-1, 3)
+        loads = np.asarray(loads).reshape(-1, 3)
         return cls(
             bin_sizes=np.asarray(bin_size)[None],
             bins=np.zeros(n, np.int64),

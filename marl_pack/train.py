@@ -19,6 +19,7 @@ import torch
 from rich.console import Console
 
 from marl_pack.agents.learning.runner import RunInterruptedError, Runner, TrainingDivergedError
+from marl_pack.agents.networks.distribution import NotFiniteError
 from marl_pack.config import Config, ConfigError, parse
 from marl_pack.terminal import complain, make_console
 from marl_pack.training.assembly import evaluation, make_runner, rank
@@ -125,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TrainingDivergedError as error:
         complain("python -m marl_pack.train", error)
         return 1
-    except (ConfigError, OSError, ModuleNotFoundError) as error:
+    except (ConfigError, NotFiniteError, OSError, ModuleNotFoundError) as error:
         nameless = isinstance(error, OSError) and error.errno and not error.filename
         where = f"{folder}: " if nameless else ""  # as where logs are written
         complain("python -m marl_pack.train", f"{where}{error}")

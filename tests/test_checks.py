@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marl_pack.checks import real_number, whole_number
+from marl_pack.checks import decimals, real_number, whole_number
 
 
 @pytest.mark.parametrize("value", [0, 7, np.int8(7), np.uint64(7)])
@@ -40,3 +40,15 @@ def test_a_real_number_is_any_finite_number(value: Any) -> None:
 def test_what_is_no_finite_number_is_refused_in_one_line(value: Any) -> None:
     with pytest.raises(ValueError, match=r"^weight: needs a finite number, not .{1,60}$"):
         real_number(value, "weight")
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
+def test_a_number_of_any_width_means_the_decimal_that_it_shows_as(dtype: type) -> None:
+    numbers = np.array(["0.7", "-0.4", "2.5"]).astype(dtype)
+    assert decimals(numbers).tolist() == [0.7, -0.4, 2.5]
+    assert [real_number(number, "weight") for number in numbers] == [0.7, -0.4, 2.5]
+
+
+def test_a_fraction_that_is_no_decimal_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^margin: needs a decimal number, not Fraction\(1, 3\)"):
+        real_number(Fraction(1, 3), "margin")

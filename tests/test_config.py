@@ -228,6 +228,8 @@ def test_null_is_refused_for_every_key_that_needs_a_value_and_leaves_no_folder(
         else:
             with pytest.raises(ConfigError, match=rf"^{re.escape(key)} = null: needs "):
                 parse([f"--config={path}"])
+            with pytest.raises(ConfigError, match=rf"^{re.escape(key)} = null: needs "):
+                parse([f"--{key}=null"])
     path.write_text("ppo:\n  schedule: null\n")
     assert main([f"--config={path}", f"--output.folder={tmp_path / 'runs'}"]) == 2
     assert "ppo.schedule = null: needs one of fixed, linear" in capsys.readouterr().err
@@ -242,6 +244,11 @@ def test_null_is_refused_for_every_key_that_needs_a_value_and_leaves_no_folder(
     ("seed: '1'", "line 1: seed: needs a whole number, without quotes"),
     ("config: x.yaml", "line 1: --config needs to be on the command line"),
     ("? [a]\n: 1", "line 1: needs the name of a key"),
+    ("null: 1", "line 1: needs the name of a key"),
+    ("seed:", "seed = null: needs a whole number"),
+    ("game:\n  bin: !!set {9, 8, 7}", "line 2: needs the name of a key"),
+    ("seed: !x 1", "line 1: seed: needs a whole number, without a tag"),
+    ("device: ''", "device = '': needs a text"),
     ("seed: " + "9" * 5000, "a value needs 4,096 characters at most"),
 ])  # fmt: skip
 def test_settings_beyond_all_need_are_refused_in_files_and_on_the_command_line(

@@ -87,6 +87,20 @@ def test_weights_that_are_not_finite_are_refused_by_every_command_and_named(
     assert [file.name for file in tmp_path.iterdir()] == ["bad.pt"]
 
 
+@pytest.mark.parametrize("options", [[], ["--symmetric"], ["--plan", "rollouts=2,top=2"]])
+def test_a_network_whose_outputs_are_no_numbers_does_not_play(
+    options: list[str], content: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = content["agents"]["placement"]["actor_state_dict"]
+    for name, tensor in weights.items():
+        weights[name] = tensor * 1e38
+    path = tmp_path / "large.pt"
+    torch.save(content, path)
+    with pytest.raises(SystemExit, match="2"):
+        evaluate(["--policy", str(path), "--episodes", "2", *options])
+    assert "an agent's network gives no numbers" in capsys.readouterr().err
+
+
 def test_a_run_whose_weights_end_up_not_finite_keeps_its_last_checkpoint(tmp_path: Path) -> None:
     runner = make_runner(tiny("--placement.network.planes=[afterstate_value]"), tmp_path)
     placement = runner.alg.learners["placement"].actor.mlp.scores.weight
@@ -299,6 +313,7 @@ def test_every_state_that_games_come_into_is_restored(options: dict[str, Any]) -
     ("state/0/random/cpu", torch.zeros(5056, dtype=torch.uint8), "no state of the random"),
     ("state/0/random/cpu", torch.zeros(9, dtype=torch.uint8), "cpu: is uint8 [9], needs uint8"),
     ("state/0/logger/cur_reward_sum", torch.zeros(3), "state.logger.cur_reward_sum: is float32"),
+    ("state/0/logger/tot_time", -1e300, "state.logger.tot_time: needs seconds from 0 to"),
     ("state/0/afterstates/rollouts", 7, "afterstates.inputs: needs"),
     ("afterstate_optimizer/state", {}, "afterstate_optimizer.state.0 is missing"),
     ("agents/placement/optimizer_state_dict/state/0/exp_avg", torch.zeros(2), "0.exp_avg: is"),

@@ -1,6 +1,12 @@
 """Decimals mean what they say: verdicts at the edge of support are those of exact fractions."""
 
+import numpy as np
+import pytest
 from fuzz.exact_stability import check_equilibrium, check_hulls
+
+from marl_pack.items import make_stream
+from marl_pack.plan import Plan
+from marl_pack.stability import in_equilibrium, stable_mask
 
 
 def test_hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge() -> None:
@@ -9,3 +15,38 @@ def test_hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge() -> None:
 
 def test_equilibrium_equals_exact_fractions_at_the_edge() -> None:
     assert check_equilibrium(seed=0, cases=150) == 150
+
+
+def test_a_decimal_of_any_width_means_what_it_says() -> None:
+    # As wide as its bin of 10 x 2, on a box at x = 0; its centre of mass lies on the edge x = 1.
+    maps = np.zeros((2, 10, 2), np.int64)
+    maps[0, 0] = 1
+    for number in (-0.4, np.float32(-0.4), np.longdouble(-0.4)):
+        offset = (number, 0.0, 0.0)
+        mask = stable_mask("hull_1", *maps, (10, 2, 1), 4, com_offset=offset)  # type: ignore[arg-type]
+        assert not mask.any()
+    narrow = np.array([[0.7, 0.5, 1.0]], np.float32)
+    plan = Plan.of_boxes((2, 2, 2), [[0, 0, 0, 1, 2, 1]], narrow)
+    assert plan.loads.tolist() == [[0.7, 0.5, 1.0]]
+    items = make_stream({"items": [[1, 1, 1]], "weights": narrow[:, 0]}, (2, 2, 2))
+    assert items.rows.weights.tolist() == [0.7]  # type: ignore[attr-defined]
+
+
+def test_weights_of_boxes_that_are_masked_are_refused() -> None:
+    maps = np.zeros((2, 2, 2), np.int64)
+    maps[0] = 1
+    weights = np.ma.masked_array([1.0], [True])
+    with pytest.raises(ValueError, match="weights: needs one number a box"):
+        stable_mask("equilibrium", *maps, (1, 1, 1), 4, [[0, 0, 0, 2, 2, 1]], weights=weights)
+
+
+@pytest.mark.parametrize("reach", [10**2, 10**4, 10**6, 10**7, 10**8, 2 * 10**8])
+@pytest.mark.parametrize(("middle", "stands"), [(1.5, True), (3.0, False), (6.0, False)])
+def test_a_long_plank_is_judged_as_a_short_one(reach: int, middle: float, stands: bool) -> None:
+    # The pillar is 0 ... 1. Equal weights on the plank's ends balance at 0, so together with the
+    # plank, as heavy as each of them, the centre of mass is a third of the plank's.
+    boxes = [(0, 0, 0, 1, 1, 1), (-reach, 0, 1, 2 * reach, 1, 1),
+             (-reach, 0, 2, 1, 1, 1), (reach - 1, 0, 2, 1, 1, 1)]  # fmt: skip
+    loads = [(4.0, 0.5, 0.5), (0.1, middle, 0.5),
+             (0.1, 0.5 - reach, 0.5), (0.1, reach - 0.5, 0.5)]  # fmt: skip
+    assert in_equilibrium(boxes, loads) == stands

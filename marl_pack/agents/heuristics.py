@@ -24,9 +24,9 @@ from marl_pack.agents.policy import (
     draw,
     in_turns,
 )
-from marl_pack.checks import shown, whole_number
+from marl_pack.checks import LARGEST_SEED, shown, whole_number
 from marl_pack.game.moves import Moves
-from marl_pack.game.packing import MOST_SEED, Packing
+from marl_pack.game.packing import Packing
 from marl_pack.geometry import resting_heights_and_waste
 
 Keys = Sequence[tuple[Tensor, int]]
@@ -242,4 +242,4 @@ def _unknown(kind: str, name: str, names: Sequence[str]) -> ValueError:
 def _generator(seed: int | None, device: torch.device | str) -> torch.Generator | None:
     if seed is None:
         return None
-    return torch.Generator(device).manual_seed(whole_number(seed, "seed", 0, MOST_SEED))
+    return torch.Generator(device).manual_seed(whole_number(seed, "seed", 0, LARGEST_SEED))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.networks.actor_critic import Actor
+from marl_pack.agents.networks.distribution import check_outputs
 from marl_pack.agents.networks.kinds import observe
 from marl_pack.agents.networks.planes import Observation
 from marl_pack.agents.networks.symmetry import mean_probabilities
@@ -37,8 +38,11 @@ class LearnedAgent:
     def probabilities(self, observation: Observation) -> Tensor:
         """Compute the probabilities of all actions, float64 [G, K]."""
         if self.symmetric:
-            return mean_probabilities(self.actor, observation, self.kind).double()
-        return self.actor.log_probs(observation).double().exp()
+            probabilities = mean_probabilities(self.actor, observation, self.kind).double()
+        else:
+            probabilities = self.actor.log_probs(observation).double().exp()
+        check_outputs(probabilities)
+        return probabilities
 
     def best(self, observation: Observation) -> Tensor:
         """Return the most probable action, int64 [G], asking the network once."""

@@ -32,6 +32,17 @@ MOST_NODES = 10_000
 """Most values in settings, those counted that anchors repeat."""
 
 
+YAML = "tag:yaml.org,2002:"
+NULL_TAG = f"{YAML}null"
+KEY_TAGS = (f"{YAML}str", f"{YAML}merge")
+"""Tags of the names of keys, and of ``<<``."""
+KINDS = ("bool", "float", "int", "null", "seq", "str", "timestamp")
+VALUE_TAGS = {f"{YAML}{kind}" for kind in KINDS}
+"""Tags of values that follow from how they are written."""
+NULLS = (None, "null", "Null", "NULL", "~")
+"""What stands for no value; on the command line a text may be any of them."""
+
+
 def make_parser() -> ArgumentParser:
     """Return the options of ``python -m marl_pack.train``: every key of :class:`Config`."""
     parser = ArgumentParser(
@@ -131,7 +142,7 @@ def check_source(source: str, option: str) -> None:
         names = set()
         for name, value in node.value:
             where = f"{path}, line {name.start_mark.line + 1}"
-            if not isinstance(name, yaml.ScalarNode):
+            if name.tag not in KEY_TAGS:
                 raise ConfigError(f"{where}: needs the name of a key")
             key = f"{prefix}{name.value}"
             if key in names:
@@ -145,8 +156,16 @@ def check_source(source: str, option: str) -> None:
                 check_section(value, f"{key}.")
             elif key in own:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
-            else:
-                check_numbers(value, key, f"{where}: ")
+            elif key in TYPES:
+                check_value(value, key, where)
+
+    def check_value(value: yaml.Node, key: str, where: str) -> None:
+        if value.tag == NULL_TAG and not may_be_null(key):
+            raise ConfigError(f"{key} = null: needs {in_words(key)}")
+        for node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+            if node.tag not in VALUE_TAGS:
+                raise ConfigError(f"{where}: {key}: needs {in_words(key)}, without a tag")
+        check_numbers(value, key, f"{where}: ")
 
     check_section(root, "")
 
@@ -215,9 +234,11 @@ def compose(text: str, name: str) -> yaml.Node | None:
 
 def build(parser: ArgumentParser, options: Namespace) -> Config:
     """Return the checked :class:`Config` of parsed options."""
-    for key, kind in TYPES.items():
-        if options[key] is None and type(None) not in get_args(kind):
+    for key in TYPES:
+        if options[key] in NULLS and not may_be_null(key):
             raise ConfigError(f"{key} = null: needs {in_words(key)}")
+        if options[key] == "":
+            raise ConfigError(f"{key} = '': needs {in_words(key)}")
     built = parser.instantiate(options)
     config = Config(**{name: built[name] for name in Config.__dataclass_fields__})
     check(config)
@@ -270,6 +291,11 @@ def _types(owner: type, prefix: str = "") -> dict[str, Any]:
 TYPES = _types(Config)
 """The type of every key."""
 WORDS = TYPE_NAMES | {Any: "the name of a rule"}
+
+
+def may_be_null(key: str) -> bool:
+    """Return whether a key may have no value."""
+    return type(None) in get_args(TYPES[key])
 
 
 def in_words(key: str) -> str:

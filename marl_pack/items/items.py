@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from marl_pack.checks import number_in, real_number
+from marl_pack.checks import decimals, number_in, real_number
 from marl_pack.geometry import ORIENTATIONS
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
@@ -143,7 +143,7 @@ class Attribute:
             if isinstance(values, np.ndarray) or only_numbers(values):
                 array = np.asarray(values)
                 if array.dtype.kind in self.kinds and array.shape == (len(values), *self.shape):
-                    return array.astype(self.dtype)
+                    return decimals(array) if self.dtype is np.float64 else array.astype(self.dtype)
         except OverflowError:
             pass
         return None
@@ -192,7 +192,7 @@ def _orientation_mask(value: Any) -> NDArray[np.bool_]:
     numbers = [ALL_ORIENTATIONS.index(_whole(number)) for number in value]
     if len(set(numbers)) < len(numbers):  # such as flags 0 and 1
         raise ValueError(value)
-    return np.isin(ALL_ORIENTATIONS, numbers)
+    return np.array([number in numbers for number in ALL_ORIENTATIONS])
 
 
 def _id(value: Any) -> str | int:

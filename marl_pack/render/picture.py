@@ -157,7 +157,8 @@ def draw(
     # Half a pixel more, as the canvas rounds down.
     figure = Figure(((columns + 0.5) / dpi, (rows + 0.5) / dpi), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    plain = title.replace("$", r"\$")  # else it would be read as mathematics
+    printable = "".join(c if c.isprintable() or c == "\n" else "?" for c in title)
+    plain = printable.replace("$", r"\$")  # else it would be read as mathematics
     figure.text(0.5, 0.975, plain, ha="center", va="top", size=12, color=_INK, wrap=True)
 
     beside = 0.28 if masks is None else 0.18

@@ -190,7 +190,7 @@ def _stack(
     load = uniform_loads(stack)
     if weights is not None:
         own_weights = np.asarray(weights)
-        if own_weights.shape != (len(stack),):
+        if own_weights.shape != (len(stack),) or np.ma.is_masked(weights):
             raise ValueError(f"weights: needs one number a box, {len(stack)}")
         load[:, 0] = [_check_weight(own_weights[row]) for row in order]
     return stack, load

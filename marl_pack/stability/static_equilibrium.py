@@ -21,7 +21,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from marl_pack.checks import shown
+from marl_pack.checks import decimals, shown
 from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 
@@ -76,7 +76,8 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
         loads: float [n, 3], weight and x, y of each centre of mass; uniform density by default.
 
     Returns:
-        The optimum; infinity for no boxes, -inf if no ``f ≥ 0`` balances the stack.
+        The optimum, less what the solver's errors may add to it; infinity for no boxes, -inf if no
+        ``f ≥ 0`` balances the stack.
     """
     n = len(boxes)
     if n == 0:
@@ -106,7 +107,12 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
     cost = np.zeros(columns + 1)
     cost[-1] = -1.0
     result = linprog(cost, A_eq=spread, b_eq=weight, bounds=(0, None), method="highs")
-    return float(-result.fun) if result.status == 0 else -np.inf
+    if result.status != 0:
+        return -np.inf
+    # Its forces balance to an absolute error; to make up for that takes as many times the error as
+    # the longest arm has cells, since a contact is at least one cell wide.
+    error = float(np.abs(spread @ result.x - weight).sum()) * float(np.abs(arm).max(initial=1.0))
+    return float(-result.fun) - error
 
 
 def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
@@ -193,7 +199,7 @@ def _check_loads(loads: ArrayLike, n: int) -> NDArray[np.float64]:
         rows = np.empty(0, object)
     if rows.dtype.kind not in "iuf" or np.ma.is_masked(loads):
         raise ValueError(f"loads: need rows weight, x, y of numbers, not {shown(loads)}")
-    rows = rows.astype(np.float64)
+    rows = decimals(rows)
     if rows.shape != (n, 3) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
         raise ValueError(f"loads: need rows weight > 0, x, y of finite numbers, [{n}, 3]")
     return rows

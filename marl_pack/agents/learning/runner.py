@@ -33,6 +33,8 @@ from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these play the same sequences
+LONGEST_RUN = 10**9
+"""Seconds that a run takes at most; TensorBoard numbers its events by them."""
 LOGGER_STATE = ("tot_timesteps", "tot_time", "cur_reward_sum", "cur_episode_length")
 LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
 
@@ -351,6 +353,8 @@ class Runner(OnPolicyRunner):
         check_form({name: logger[name] for name in LOGGER_BUFFERS}, {str: [float]}, "state.logger")
         if logger["tot_timesteps"] != loaded["items"]:
             raise ValueError(f"state.logger.tot_timesteps: needs {loaded['items']}")
+        if not 0 <= logger["tot_time"] <= LONGEST_RUN:
+            raise ValueError(f"state.logger.tot_time: needs seconds from 0 to {LONGEST_RUN:,}")
         return self._checked_learners(loaded)
 
     def _checked_learners(self, checkpoint: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,20 @@ LARGEST = 1e8
 """Logits are kept within ± this, well above :data:`FORBIDDEN`."""
 
 
+class NotFiniteError(ValueError):
+    """The outputs of a network are no numbers, as its weights are too large."""
+
+
+def check_outputs(outputs: Tensor) -> None:
+    """Refuse to choose an action by outputs that are not numbers.
+
+    Raises:
+        NotFiniteError: if one is NaN.
+    """
+    if bool(outputs.isnan().any()):
+        raise NotFiniteError("an agent's network gives no numbers: its weights are too large")
+
+
 class MaskedCategorical(Distribution):
     """A categorical distribution over K actions that draws only legal ones.
 
@@ -58,7 +72,12 @@ class MaskedCategorical(Distribution):
         return torch.where(possible, drawn, best).to(total.dtype)
 
     def deterministic_output(self, mlp_output: Tensor) -> Tensor:
-        """Return the most probable action of each row (the first of equals), float [B, 1]."""
+        """Return the most probable action of each row (the first of equals), float [B, 1].
+
+        Raises:
+            NotFiniteError: if a logit is NaN.
+        """
+        check_outputs(mlp_output)
         return self.masked(mlp_output).argmax(-1, keepdim=True).float()
 
     def as_deterministic_output_module(self) -> nn.Module:
