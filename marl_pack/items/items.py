@@ -195,6 +195,12 @@ def _orientation_mask(value: Any) -> NDArray[np.bool_]:
     return np.array([number in numbers for number in ALL_ORIENTATIONS])
 
 
+def _is_text(text: str) -> bool:
+    """Return whether a text can be an id: not empty, not too long, and writable as UTF-8."""
+    surrogate = any("\ud800" <= character <= "\udfff" for character in text)
+    return 0 < len(text) <= LONGEST_ID and not surrogate
+
+
 def _id(value: Any) -> str | int:
     """Return an id that is a text or a whole number."""
     number = value if isinstance(value, str) else _whole(value)
@@ -205,7 +211,7 @@ def _id(value: Any) -> str | int:
 
 def _short(ids: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which texts among ids have an allowed length, bool [R]."""
-    return np.array([not isinstance(i, str) or 0 < len(i) <= LONGEST_ID for i in ids], bool)
+    return np.array([not isinstance(i, str) or _is_text(i) for i in ids], bool)
 
 
 ATTRIBUTES = (

@@ -223,6 +223,10 @@ def whole_cells(name: str, values: ArrayLike) -> NDArray[np.int64]:
         return array.astype(np.int64)
     if np.ma.is_masked(values):
         raise ValueError(f"{name}: needs all its values, but some are masked")
+    if not isinstance(values, np.ndarray) and any(
+        isinstance(value, bool) for value in np.asarray(values, object).flat
+    ):
+        raise ValueError(f"{name}: needs whole numbers of cells, not true or false")
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all() or (array % 1 != 0).any():
         raise ValueError(f"{name}: needs whole numbers of cells, got {array.dtype} values with a"
                          " fraction, NaN or another type")  # fmt: skip

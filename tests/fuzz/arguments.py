@@ -17,6 +17,7 @@ from marl_pack.stability import in_equilibrium, make_rule, stable_mask
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, 5, -1, 2.5, 1.0, float("nan"), float("inf"), 10**400, 2**63, 2**31,
     "1", "", "hull", "\x1b[31m", [], {}, [1, 2], (1, 2, 3), [[1, 2, 3]], [[2, 2, [1]]], [True] * 3,
+    (True, 2, 1),
     ["1", "2", "3"], np.array([1, 2, 3], np.uint8), np.array([0.5] * 3), np.array("x"),
     np.ma.array([1, 2, 3], mask=[0, 0, 1]), np.float32(0.1), np.int8(3), torch.tensor(3),
     torch.tensor([1, 2, 3]), object(), b"1", 1j, range(3), {1: 2}, float, -0.0, 1e-300,

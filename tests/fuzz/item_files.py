@@ -89,7 +89,7 @@ def bad_items() -> Iterator[Case]:
         "weights": (None, True, "5", -1, 0, 10**400, float("nan"), [1]),
         "upright": (None, 2, "maybe", [True]),
         "orientations": (None, 0, [], [6], [True], "01", [0, 0], [1.5], ["0"]),
-        "ids": (None, "", True, 1.5, "x" * 1000, 10**400, ["a"]),
+        "ids": (None, "", "\ud800", True, 1.5, "x" * 1000, 10**400, ["a"]),
         "quantity": (None, True, "2", 1.5, 0, -1, 10**9, 10**30, float("inf")),
         "lengths": (None, True, "1", 1.0, 0, 2),
     }
