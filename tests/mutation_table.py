@@ -338,18 +338,13 @@ MUTATIONS = (
        "        if distance <= error:", "        if distance < -error:\n"
        "            return OUTSIDE\n" "        if distance < error:",
        "exact_stability::hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge"),
-    _m("stability: a point at the hull's end is inside", "stability/hull_exact.py",
-       "    if distance <= -error:\n" "        return OUTSIDE\n"
-       "    verdict = UNSURE if distance <= error else INSIDE", "    if distance < -error:\n"
-       "        return OUTSIDE\n" "    verdict = UNSURE if distance < error else INSIDE",
-       "exact_stability::hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge"),
     _m("stability: a point on the hull's edge is inside (tensor)", "stability/hull_tensor.py",
        "sure, possible = pair & (cross > error),", "sure, possible = pair & (cross >= error),",
        "backends::hull_masks_equal_the_reference"),
     _m("stability: a margin is reached at the edge (tensor)", "stability/hull_tensor.py",
        "sure, possible = distance > error, (distance > error)",
        "sure, possible = distance >= error, (distance > error)",
-       "exact_stability::hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge"),
+       "exact_stability::a_margin_that_is_just_reached_at_a_slanted_edge_is_not_enough"),
     _m("stability: contact over a gap bears", "stability/hull_compiled.py",
        "if best <= top[i] and best & 1 == 1 else 0", "if best <= top[i] else 0",
        "backends::hull_masks_equal_the_reference"),

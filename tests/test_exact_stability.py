@@ -1,12 +1,24 @@
 """Decimals mean what they say: verdicts at the edge of support are those of exact fractions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
+from conftest import stack
 from fuzz.exact_stability import check_equilibrium, check_hulls
 
+from marl_pack.backend import Backend
 from marl_pack.items import make_stream
 from marl_pack.plan import Plan
-from marl_pack.stability import in_equilibrium, stable_mask
+from marl_pack.stability import (
+    OrientedItem,
+    hull_1,
+    hull_alpha,
+    in_equilibrium,
+    lbcp,
+    stable_mask,
+)
 
 
 def test_hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge() -> None:
@@ -15,6 +27,20 @@ def test_hull_rules_and_area_ratio_equal_exact_fractions_at_the_edge() -> None:
 
 def test_equilibrium_equals_exact_fractions_at_the_edge() -> None:
     assert check_equilibrium(seed=0, cases=150) == 150
+
+
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize(("margin", "stands"), [(0.99, True), (1.0, False), (1.01, False)])
+def test_a_margin_that_is_just_reached_at_a_slanted_edge_is_not_enough(
+    backend: Backend, margin: float, stands: bool
+) -> None:
+    # Pillars of one cell at (0, 0), (3, 4) and (6, 0). The hull's edge from (0, 1) to (3, 5) is 5
+    # long, and the centre of mass, (2, 2), lies exactly 1 from it.
+    bins = stack((8, 5, 3), (0, 0, 0, 1, 1, 1), (3, 4, 0, 1, 1, 1), (6, 0, 0, 1, 1, 1))
+    bins = replace(bins, backend=backend)
+    item = OrientedItem(torch.tensor([[[8, 5, 1]]], dtype=torch.int16), ((-0.25, -0.1),))
+    for rule in (hull_1, hull_alpha, lbcp):
+        assert bool(rule(bins, item, margin)[0, 0, 0, 0]) == stands
 
 
 def test_a_decimal_of_any_width_means_what_it_says() -> None:
