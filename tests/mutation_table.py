@@ -390,7 +390,7 @@ MUTATIONS = (
        "exact_stability::equilibrium_equals_exact_fractions_at_the_edge"),
     _m("stability: a small pivot is trusted", "stability/simplex.py",
        "if row < 0 or table[row, column] < SMALLEST_PIVOT:", "if row < 0:",
-       "exact_stability::equilibrium_equals_exact_fractions_at_the_edge"),
+       "exact_stability::arms_of_a_billionth_do_not_mislead_the_simplex"),
     _m("stability: weights are rounded to float32", "stability/arrays.py",
        "torch.tensor([_check_weight(weight)], dtype=torch.float64)",
        "torch.tensor([_check_weight(weight)])",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import stack
-from fuzz.exact_stability import check_equilibrium, check_hulls
+from fuzz.exact_stability import check_equilibrium, check_hulls, mirrored_case
 
 from marl_pack.backend import Backend
 from marl_pack.items import make_stream
@@ -17,6 +17,7 @@ from marl_pack.stability import (
     hull_alpha,
     in_equilibrium,
     lbcp,
+    reference,
     stable_mask,
 )
 
@@ -41,6 +42,30 @@ def test_a_margin_that_is_just_reached_at_a_slanted_edge_is_not_enough(
     item = OrientedItem(torch.tensor([[[8, 5, 1]]], dtype=torch.int16), ((-0.25, -0.1),))
     for rule in (hull_1, hull_alpha, lbcp):
         assert bool(rule(bins, item, margin)[0, 0, 0, 0]) == stands
+
+
+@pytest.mark.parametrize(
+    ("weights", "offset", "margin"),
+    [((7.141092, 2.93, 4.861280880536798), (1e-9, 0.0, 0.0), 0.3),
+     ((2.289, 0.78, 4.382970433658), (0.0, -1e-9, 0.0), 0.0)],
+)  # fmt: skip
+def test_arms_of_a_billionth_do_not_mislead_the_simplex(
+    weights: tuple[float, float, float], offset: tuple[float, float, float], margin: float
+) -> None:
+    # A plank that its pillar alone does not hold, and an item that balances it: so small an arm is
+    # a pivot that blows up rounding errors.
+    left, length = (1, 6) if margin else (3, 9)
+    boxes = np.array([[left, 0, 0, 1, 2, 1], [0, 0, 1, length, 2, 1]])
+    heights, empty = np.zeros((12, 2), np.int64), np.zeros((12, 2), np.int64)
+    for x, y, _, w, d, h in boxes.tolist():
+        reference.place_box(heights, empty, (x, y), (w, d, h))
+    x = 0 if margin else 3
+    case = {
+        "heightmap": heights, "empty_map": empty, "item": (1, 1, 1), "bin_height": 6,
+        "boxes": boxes, "weights": weights[:2], "weight": weights[2], "com_offset": offset,
+    }  # fmt: skip
+    for own, place in ((case, x), (mirrored_case(case), 11 - x)):
+        assert stable_mask("equilibrium", **own, margin=margin)[place].all()
 
 
 def test_a_decimal_of_any_width_means_what_it_says() -> None:
