@@ -44,6 +44,17 @@ def test_a_margin_that_is_just_reached_at_a_slanted_edge_is_not_enough(
         assert bool(rule(bins, item, margin)[0, 0, 0, 0]) == stands
 
 
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize(("offset", "stands"), [(-1e-17, True), (0.0, False), (1e-17, False)])
+def test_a_centre_of_mass_next_to_the_middle_is_not_in_it(
+    backend: Backend, offset: float, stands: bool
+) -> None:
+    # Pillars at (0, 2) and (1, 1) under a box of 2 x 6, whose middle (1, 3) is a corner of the hull.
+    bins = replace(stack((2, 6, 3), (0, 2, 0, 1, 1, 1), (1, 1, 0, 1, 1, 1)), backend=backend)
+    item = OrientedItem(torch.tensor([[[2, 6, 1]]], dtype=torch.int16), ((0.0, offset),))
+    assert bool(hull_1(bins, item)[0, 0, 0, 0]) == stands
+
+
 @pytest.mark.parametrize(
     ("weights", "offset", "margin"),
     [((7.141092, 2.93, 4.861280880536798), (1e-9, 0.0, 0.0), 0.3),

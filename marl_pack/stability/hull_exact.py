@@ -231,7 +231,7 @@ def solve_undecided(
     width, depth = levels.shape
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
     upper, lower = scratch[1], scratch[2]
-    middle = margin == 0.0 and 2 * x == w * unit and 2 * y == d * unit
+    middle = whole and margin == 0.0 and 2 * x == w * unit and 2 * y == d * unit
     unsure = 0
     # Large windows come in clusters over the same level: mark its cells once, then look up.
     marks = np.empty((2, width, depth) if w * d > LOOKUP_CELLS else (2, 0, 0), np.int16)
