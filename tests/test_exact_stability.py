@@ -49,7 +49,7 @@ def test_a_margin_that_is_just_reached_at_a_slanted_edge_is_not_enough(
 def test_a_centre_of_mass_next_to_the_middle_is_not_in_it(
     backend: Backend, offset: float, stands: bool
 ) -> None:
-    # Pillars at (0, 2) and (1, 1) under a box of 2 x 6, whose middle (1, 3) is a corner of the hull.
+    # Pillars at (0, 2) and (1, 1) under a box of 2 x 6: its middle (1, 3) is a corner of the hull.
     bins = replace(stack((2, 6, 3), (0, 2, 0, 1, 1, 1), (1, 1, 0, 1, 1, 1)), backend=backend)
     item = OrientedItem(torch.tensor([[[2, 6, 1]]], dtype=torch.int16), ((0.0, offset),))
     assert bool(hull_1(bins, item)[0, 0, 0, 0]) == stands
