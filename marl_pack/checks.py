@@ -56,7 +56,7 @@ def whole_number(value: Any, what: str, low: int, high: int | None = None) -> in
     Raises:
         ValueError: naming the value and what it needs to be.
     """
-    whole = not isinstance(value, bool) and isinstance(value, Integral)
+    whole = type(value) is int or (not isinstance(value, bool) and isinstance(value, Integral))
     if not whole or value < low or (high is not None and value > high):
         limits = f">= {low}" if high is None else f"from {low} to {high}"
         raise ValueError(f"{what}: needs a whole number {limits}, not {shown(value)}")

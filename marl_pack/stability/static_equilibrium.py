@@ -221,15 +221,18 @@ def whole_cells(name: str, values: ArrayLike) -> NDArray[np.int64]:
         raise ValueError(f"{name}: needs an array of whole numbers ({error})") from None
     if array.size == 0:
         return array.astype(np.int64)
-    if np.ma.is_masked(values):
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise ValueError(f"{name}: needs all its values, but some are masked")
     if not isinstance(values, np.ndarray) and any(
         isinstance(value, bool) for value in np.asarray(values, object).flat
     ):
         raise ValueError(f"{name}: needs whole numbers of cells, not true or false")
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all() or (array % 1 != 0).any():
+    whole = array.dtype.kind in "iu" or (
+        array.dtype.kind == "f" and np.isfinite(array).all() and not (array % 1).any()
+    )
+    if not whole:
         raise ValueError(f"{name}: needs whole numbers of cells, got {array.dtype} values with a"
                          " fraction, NaN or another type")  # fmt: skip
-    if (array >= MAX_LENGTH).any() or (array <= -MAX_LENGTH).any():
+    if array.max() >= MAX_LENGTH or array.min() <= -MAX_LENGTH:
         raise ValueError(f"{name}: needs numbers of cells below {MAX_LENGTH}")
     return array.astype(np.int64)
