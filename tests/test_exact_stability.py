@@ -85,13 +85,13 @@ def test_a_decimal_of_any_width_means_what_it_says() -> None:
     maps[0, 0] = 1
     for number in (-0.4, np.float32(-0.4), np.longdouble(-0.4)):
         offset = (number, 0.0, 0.0)
-        mask = stable_mask("hull_1", *maps, (10, 2, 1), 4, com_offset=offset)  # type: ignore[arg-type]
+        mask = stable_mask("hull_1", *maps, (10, 2, 1), 4, com_offset=offset)  # type: ignore[arg-type]  # NumPy floats
         assert not mask.any()
     narrow = np.array([[0.7, 0.5, 1.0]], np.float32)
     plan = Plan.of_boxes((2, 2, 2), [[0, 0, 0, 1, 2, 1]], narrow)
     assert plan.loads.tolist() == [[0.7, 0.5, 1.0]]
     items = make_stream({"items": [[1, 1, 1]], "weights": narrow[:, 0]}, (2, 2, 2))
-    assert items.rows.weights.tolist() == [0.7]  # type: ignore[attr-defined]
+    assert items.rows.weights.tolist() == [0.7]  # type: ignore[attr-defined]  # a given sequence
 
 
 def test_weights_of_boxes_that_are_masked_are_refused() -> None:

@@ -21,7 +21,7 @@ class Range(NamedTuple):
     open: bool = False  # whether low itself is too low
 
     def __contains__(self, value: object) -> bool:
-        low_enough = self.low < value if self.open else self.low <= value  # type: ignore[operator]
+        low_enough = self.low < value if self.open else self.low <= value  # type: ignore[operator]  # only numbers have ranges
         return bool(low_enough and value <= self.high)  # type: ignore[operator]  # NaN is not in
 
     def __str__(self) -> str:

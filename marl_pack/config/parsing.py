@@ -284,7 +284,7 @@ def _types(owner: type, prefix: str = "") -> dict[str, Any]:
     kinds: dict[str, Any] = {}
     for name, kind in get_type_hints(owner).items():
         key = prefix + name
-        kinds |= _types(kind, f"{key}.") if is_dataclass(kind) else {key: kind}  # type: ignore[arg-type]
+        kinds |= _types(kind, f"{key}.") if is_dataclass(kind) else {key: kind}  # type: ignore[arg-type]  # a dataclass is a type here
     return kinds
 
 
