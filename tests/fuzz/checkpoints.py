@@ -55,7 +55,7 @@ TENSORS: dict[str, Callable[[Tensor], Tensor]] = {
     "plus 1": _first(lambda value: value + 1 if not isinstance(value, bool) else not value),
     "far": _first(lambda value: 100 if not isinstance(value, bool) else not value),
 }  # fmt: skip
-"""Changes of tensors."""
+"""Changes of a tensor by name, each to another tensor."""
 
 
 def paths(value: Any, path: Path_ = ()) -> Iterator[Path_]:

@@ -49,7 +49,7 @@ PLAN: dict[str, Any] = {
          "weight": 1.0, "centre_x": 4.5, "centre_y": 2.5},
     ],
 }  # fmt: skip
-"""What :meth:`marl_pack.plan.Plan.to_json` writes."""
+"""A plan of two boxes as :meth:`marl_pack.plan.Plan.to_json` writes it."""
 
 
 def archive(**arrays: Any) -> bytes:

@@ -231,7 +231,7 @@ class Tally:
     faults: list[dict[str, str]] = field(default_factory=list)
 
     def add(self, case: str, outcome: str, detail: str) -> None:
-        """Count one case."""
+        """Count the outcome of one case, and keep it if it is a fault."""
         self.outcomes[outcome] += 1
         if outcome in FAULTS:
             self.faults.append({"case": case, "outcome": outcome, "detail": detail})
