@@ -27,7 +27,7 @@ ONLY = {
     "env_aec": {"bins", "checks", "game", "geometry", "installation", "items", "plan", "render"},
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
              "renamed", "stability"},
-    "render": {"bins", "files", "geometry", "render"},
+    "render": {"bins", "files", "geometry", "plan", "render"},
 }  # fmt: skip
 
 

@@ -1,9 +1,13 @@
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image, ImageSequence
 
+from marl_pack.plan import Plan
+from marl_pack.render.animation import save_gif
 from marl_pack.render.picture import PALETTE, draw, paint_order, save
 
 SIZE = (10, 10, 10)
@@ -219,3 +223,16 @@ def test_a_title_is_drawn_as_it_is() -> None:
     boxes = np.zeros((0, 6), int)
     plain, titled = (draw((4, 4, 4), boxes, title=t) for t in ("", "runs/$a_$ plays"))
     assert np.any(plain != titled)
+
+
+def test_an_animation_shows_every_placement_and_keeps_the_bin_in_its_place(tmp_path) -> None:
+    boxes = np.array([(0, 0, 0, 4, 4, 2), (0, 0, 2, 4, 4, 2), (0, 4, 0, 2, 2, 3)])
+    save_gif(tmp_path / "bin.gif", Plan.of_boxes((8, 8, 8), boxes), "a policy")
+    with Image.open(tmp_path / "bin.gif") as film:
+        frames = [
+            np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film)
+        ]
+    assert len(frames) == len(boxes) + 1
+    floor = [np.argwhere((frame == 232).all(2))[:, 0].max() for frame in frames]
+    assert len(set(floor)) == 1  # the front corner of the floor, which no box hides
+    assert all(np.any(before != after) for before, after in pairwise(frames))

@@ -130,6 +130,7 @@ def draw(
     labels: Sequence[str] = (),
     title: str = "",
     pixels: tuple[int, int] = (960, 600),
+    leave_space: bool = False,
 ) -> NDArray[np.uint8]:
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
@@ -144,6 +145,8 @@ def draw(
         labels: a title for each of the A masks, or none.
         title: of the whole picture.
         pixels: (columns, rows) of the picture.
+        leave_space: whether the space of the item stays empty where none comes, so that the bin
+            stands at the same place in every picture.
 
     Returns:
         uint8 [rows, columns, 3], RGB.
@@ -162,7 +165,7 @@ def draw(
     figure.text(0.5, 0.975, plain, ha="center", va="top", size=12, color=_INK, wrap=True)
 
     beside = 0.28 if masks is None else 0.18
-    left = 0.05 if item is None else beside + 0.04
+    left = 0.05 if item is None and not leave_space else beside + 0.04
     right = 0.93 if masks is None else 0.61
     scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked)
     if item is not None:
