@@ -8,7 +8,7 @@ imported from its module at its first use.
 import lazy_loader
 import pettingzoo
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -2,8 +2,10 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+import yaml
 
 import marl_pack
 
@@ -23,3 +25,8 @@ def test_importing_the_package_alone_loads_no_torch() -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="Pakcing"):
         marl_pack.Pakcing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_citation_names_the_version_of_the_package() -> None:
+    citation = yaml.safe_load((Path(__file__).parent.parent / "CITATION.cff").read_text("utf-8"))
+    assert citation["version"] == marl_pack.__version__
