@@ -19,6 +19,7 @@ import torch
 from rich.console import Console
 from torch import Tensor, nn
 
+from marl_pack import published
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -156,12 +157,18 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
 def run(source: str, folder: Path | None, form: str, console: Console) -> None:
     """Write every agent of a checkpoint, and its critic of afterstates.
 
+    Args:
+        source: a published model's name, or the path of a checkpoint or a run's folder.
+        folder: to write to; by default the checkpoint's, or ``./NAME`` for a published model.
+        form: ``onnx`` or ``rsl_rl``.
+        console: says what was written.
+
     Raises:
         ValueError, OSError: if the checkpoint cannot be read or a file cannot be written.
     """
     path = checkpoints.resolve(source)
     checkpoint = checkpoints.read(path)
-    folder = folder or path.parent
+    folder = folder or (path.parent if published.is_path(source) else Path(source))
     folder.mkdir(parents=True, exist_ok=True)
     for name, agent in checkpoint["agents"].items():
         console.print(export_agent(agent, name, folder, form), soft_wrap=True)
@@ -178,12 +185,15 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``python -m marl_pack.export``; return its exit status."""
     options = Parser(prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0])
-    options.add_argument("checkpoint", help="a checkpoint or a run's folder")
+    options.add_argument("checkpoint", help="a published model, a checkpoint or a run's folder")
     options.add_argument(
         "--format", choices=["onnx", "rsl_rl"], default="onnx",
         help="ONNX (default), or the state that a stock rsl_rl PPO loads",
     )  # fmt: skip
-    options.add_argument("--folder", type=Path, help="to write to (default: beside the checkpoint)")
+    options.add_argument(
+        "--folder", type=Path,
+        help="to write to (default: beside the checkpoint; ./NAME for a published model)",
+    )  # fmt: skip
     chosen = options.parse_args(arguments)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from marl_pack import published
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import Policy, in_turns
 from marl_pack.bins import check_device
@@ -76,14 +77,14 @@ def add_options(options: argparse.ArgumentParser) -> None:
     """Add the options of :func:`choose` to a command."""
     add = options.add_argument
     add("--policy", nargs="+", metavar="NAME",
-        help=f"one or more of {', '.join(POLICIES)}, runs' folders or checkpoints "
-             "(default: dblf)")  # fmt: skip
+        help=f"one or more of {', '.join((*POLICIES, *published.models()))}, runs' folders or "
+             "checkpoints (default: dblf)")  # fmt: skip
     add("--orientation", metavar="NAME",
         help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, a "
-             "run's folder or a checkpoint")  # fmt: skip
+             "published model, a run's folder or a checkpoint")  # fmt: skip
     add("--placement", metavar="NAME",
-        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a run's "
-             "folder or a checkpoint")  # fmt: skip
+        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a "
+             "published model, a run's folder or a checkpoint")  # fmt: skip
     add("--plan", metavar="rollouts=K,top=M",
         help="learned agents try their M best pairs in K imagined futures before each placement; "
              "depth=D ends each future after D items by the critic's value")  # fmt: skip

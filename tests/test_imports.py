@@ -9,7 +9,8 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "checks", "files", "inputs", "installation", "renamed", "terminal"),
+    ("backend", "checks", "files", "inputs", "installation", "published", "renamed",
+     "terminal"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
     ("stability", "sapien_check"),

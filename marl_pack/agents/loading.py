@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack import renamed
+from marl_pack import published, renamed
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.lookahead import Lookahead, Memo
 from marl_pack.agents.heuristics import (
@@ -63,8 +63,8 @@ class Loader:
         """Return the policy that ``source`` names.
 
         Args:
-            source: one of :data:`marl_pack.agents.heuristics.POLICIES`, a run's folder or a
-                checkpoint.
+            source: one of :data:`marl_pack.agents.heuristics.POLICIES`, a published model's name
+                (:mod:`marl_pack.published`), or the path of a run's folder or a checkpoint.
 
         Raises:
             ValueError, FileNotFoundError: if it is none of these.
@@ -250,7 +250,8 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     """Return the record of an agent of another run, or of a heuristic.
 
     Args:
-        source: a heuristic's name, a run's folder or a checkpoint.
+        source: a heuristic's or a published model's name, or the path of a run's folder or a
+            checkpoint.
         name: ``orientation`` or ``placement``.
 
     Raises:
@@ -302,14 +303,10 @@ def _named(source: str) -> Iterator[None]:
 
 
 def _path(source: str, names: Sequence[str]) -> Path:
-    """Return ``source`` as a path.
+    """Return the path of the checkpoint or the run's folder that ``source`` names.
 
     Raises:
-        ValueError, FileNotFoundError: if it does not exist; names what would be right.
+        ValueError: if it is no path and no published model's name; says what would be right.
     """
     renamed.refuse_old(source, renamed.POLICIES, "policy")
-    if not Path(source).exists():
-        raise FileNotFoundError(
-            f"{source!r}: needs one of {', '.join(names)}, a checkpoint or a run's folder"
-        )
-    return Path(source)
+    return published.model(source, names)

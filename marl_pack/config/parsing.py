@@ -15,7 +15,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
-from marl_pack import renamed
+from marl_pack import published, renamed
 from marl_pack.checks import TYPE_NAMES, one_line, shown
 from marl_pack.config.checks import ConfigError, check
 from marl_pack.config.schema import Config
@@ -51,7 +51,11 @@ def make_parser() -> ArgumentParser:
         exit_on_error=False,
         allow_abbrev=False,
     )
-    parser.add_argument("--config", action="config", help="YAML file of settings; may be repeated")
+    parser.add_argument(
+        "--config", action="config",
+        help=f"one of {', '.join(published.configs())}, or a YAML file of settings; may be "
+        "repeated",
+    )  # fmt: skip
     parser.add_argument(
         "--resume", metavar="RUN", default=None,
         help="continue the run in this folder exactly; only output.*, evaluation.* and "
@@ -73,13 +77,37 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
     Raises:
         ConfigError: for an unknown key, a wrong type or an impossible value.
     """
-    words = sys.argv[1:] if arguments is None else arguments
+    words = list(_with_paths(sys.argv[1:] if arguments is None else arguments))
     parser = make_parser()
     for option, source in check_words(words, ["config", *sections()]):
         check_source(source, option)
     with _explained(parser):
         options = parser.parse_args(words)
         return build(parser, options), options
+
+
+def _with_paths(words: Sequence[str]) -> Iterator[str]:
+    """Yield the words of a command line, with paths in place of the names of published settings.
+
+    Raises:
+        ConfigError: for a name that is none of theirs.
+    """
+    for before, word in pairwise(("", *words)):
+        option, equals, value = word.partition("=")
+        try:
+            if before == "--config" and not is_text(word):
+                yield str(published.config(word))
+            elif option == "--config" and equals and not is_text(value):
+                yield f"--config={published.config(value)}"
+            else:
+                yield word
+        except ValueError as error:
+            raise ConfigError(f"--config {error}") from None
+
+
+def is_text(source: str) -> bool:
+    """Return whether what stands for a file of settings is its text, and not its path."""
+    return "\n" in source or source.lstrip()[:1] == "{"
 
 
 def sections() -> set[str]:
@@ -119,7 +147,7 @@ def check_source(source: str, option: str) -> None:
     """
     path = source
     try:
-        if "\n" in source or source.lstrip()[:1] == "{":
+        if is_text(source):
             text, path = source, option
         elif "\0" in source or not Path(source).is_file():
             raise ConfigError(f"{option} {shown(source)}: there is no such file of settings")

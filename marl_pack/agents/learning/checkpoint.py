@@ -29,6 +29,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from marl_pack import published
 from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learning import migration
 from marl_pack.agents.learning.form import (
@@ -91,12 +92,17 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def resolve(source: str | Path) -> Path:
-    """Return the checkpoint file that ``source`` names: a file, or a run's best, else its latest.
+    """Return the checkpoint file that ``source`` names.
+
+    Args:
+        source: a published model's name, or the path of a checkpoint or of a run's folder: there
+            its best, else its latest.
 
     Raises:
         FileNotFoundError: if there is none.
+        ValueError: for a name that is none of a published model.
     """
-    path = Path(source)
+    path = published.model(source)
     if path.is_dir():
         for name in (BEST, LATEST):
             if (path / name).is_file():
@@ -108,7 +114,11 @@ def resolve(source: str | Path) -> Path:
 
 
 def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint, from a file or a run's folder, in the format of this version.
+    """Read a checkpoint in the format of this version.
+
+    Args:
+        source: as for :func:`resolve`.
+        device: of its tensors.
 
     Raises:
         FileNotFoundError: if there is none.
