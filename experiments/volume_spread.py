@@ -1,15 +1,16 @@
-"""Draw utilization against the spread of item volumes, as the paper's figure does.
+"""Draw utilization against the spread of item volumes: ``python -m experiments.volume_spread``.
 
-``python -m benchmarks.volume_spread CHECKPOINT --items rs.npz`` plays every sequence, groups the
-episodes by the standard deviation of the volumes of their sequence's items and draws the mean
-utilization of each group with its 95 % interval, beside the rank correlation over all episodes.
+As in the paper's figure, episodes are grouped by the standard deviation of the volumes of their
+sequence's items. The picture shows the mean utilization of each group with its 95 % interval; the
+rank correlation is that of all episodes.
 """
 
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -17,16 +18,19 @@ import torch
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.timing import show
-from marl_pack.agents.heuristics import POLICIES
+from benchmarks.record import ROOT, Results, record
+from experiments.rows import expanded, main_of, mean
 from marl_pack.agents.loading import Loader
 from marl_pack.evaluation.rollout import play
-from marl_pack.evaluation.statistics import interval
 from marl_pack.files import moved_into_place
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import Size
 from marl_pack.items import Stream, choose_stream
 
+mpl.use("Agg")
+from matplotlib import pyplot as plt  # once it is known that nothing is shown
+
+POLICIES = ("models/rs.pt", "max_feasible", "dblf")
 GROUPS = 8
 
 
@@ -60,58 +64,49 @@ def utilization(policy: str, stream: Stream, size: Size, episodes: int) -> NDArr
     return play(chosen, game, episodes).utilization
 
 
-def main() -> None:
-    """Draw the picture and print the table."""
-    options = argparse.ArgumentParser(prog="python -m benchmarks.volume_spread")
-    options.add_argument("policies", nargs="+", help="checkpoints, runs' folders or heuristics")
-    options.add_argument("--items", required=True, help="a file of sequences")
-    options.add_argument("--picture", type=Path, default=Path("docs/volume_spread.png"))
+def main() -> int:
+    """Play the policies, draw the picture and keep the figures; return the exit status."""
+    options = argparse.ArgumentParser(prog="python -m experiments.volume_spread")
+    options.add_argument("policies", nargs="*", default=POLICIES,
+                         help="checkpoints, runs' folders or heuristics")  # fmt: skip
+    options.add_argument("--items", default="$MARL_PACK_DATA/rs.npz", help="a file of sequences")
+    options.add_argument("--picture", type=Path, default=ROOT / "docs" / "volume_spread.png")
     chosen = options.parse_args()
     torch.set_num_threads(1)
-    stream, size = choose_stream(chosen.items, None, (2, 5))
+    [items] = expanded(chosen.items)
+    stream, size = choose_stream(items, None, (2, 5))
     if stream.episodes is None:
-        options.error(f"--items {chosen.items}: has sequences without end; give a file")
+        raise ValueError(f"--items {chosen.items}: has sequences without end; give a file")
     spread = volume_spread(stream, stream.episodes, 0)
     edges = np.quantile(spread, np.linspace(0, 1, GROUPS + 1))
     group = np.clip(np.searchsorted(edges, spread, side="right") - 1, 0, GROUPS - 1)
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     figure, panel = plt.subplots(figsize=(7, 4), layout="constrained")
-    table: list[list[Any]] = []
     for p, policy in enumerate(chosen.policies):
         reached = 100 * utilization(policy, stream, size, stream.episodes)
-        name = policy if policy in POLICIES else Path(policy).stem
+        groups = [mean(reached[group == k]) for k in range(GROUPS)]
+        middle = [np.median(spread[group == k]) for k in range(GROUPS)]
         panel.scatter(spread, reached, s=2, alpha=0.15, color=f"C{p}")
-        middle, mean, half = [], [], []
-        for k in range(GROUPS):
-            own = reached[group == k]
-            low, high = interval(own) or (np.nan, np.nan)
-            middle.append(np.median(spread[group == k]))
-            mean.append(own.mean())
-            half.append((high - low) / 2)
-        panel.errorbar(middle, mean, half, marker="o", markersize=3, capsize=2, label=name,
+        centres, halves = [g["mean"] for g in groups], [g["half"] for g in groups]
+        panel.errorbar(middle, centres, halves, marker="o", markersize=3, capsize=2, label=policy,
                        color=f"C{p}")  # fmt: skip
-        rank = stats.spearmanr(spread, reached)
-        slope = stats.linregress(spread, reached)
-        table.append(
-            [name, f"{rank.statistic:+.3f} (p = {rank.pvalue:.2g})",
-             f"{10 * slope.slope:+.2f} ± {19.6 * slope.stderr:.2f}",
-             f"{mean[0]:.1f}", f"{mean[-1]:.1f}"]
-        )  # fmt: skip
+        rank, line = stats.spearmanr(spread, reached), stats.linregress(spread, reached)
+        figures = {
+            "items": chosen.items, "episodes": stream.episodes,
+            "rank_correlation": float(rank.statistic), "p": float(rank.pvalue),
+            "points_per_10_cells": {"mean": 10 * line.slope, "half": 19.6 * line.stderr},
+            "first_eighth": groups[0]["mean"], "last_eighth": groups[-1]["mean"],
+        }  # fmt: skip
+        command = f"python -m experiments.volume_spread {shlex.join(chosen.policies)}"
+        Results("volume_spread").put(policy, figures, record(command))
+        print(policy, figures)
     panel.set_xlabel("standard deviation of the item volumes of a sequence, cells")
     panel.set_ylabel("utilization, %")
     panel.grid(alpha=0.3)
     panel.legend(loc="lower left")
     with moved_into_place(chosen.picture) as part:
         figure.savefig(part, dpi=120)
-    show(
-        f"{stream.episodes} sequences",
-        ["policy", "rank correlation", "points per 10 cells", "first eighth", "last eighth"],
-        table,
-    )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_of(main))

@@ -1,18 +1,18 @@
-"""Compare agents with their afterstate critic alone: ``python -m benchmarks.afterstates RUN …``.
+"""Compare agents with their critic of afterstates alone: ``python -m experiments.afterstates``.
 
 Plays the same generated sequences, of the items that each checkpoint was trained on, once with its
-agents and once greedily, always taking the placement with the highest value. Prints the mean
-utilization of both and the difference episode by episode, with 95 % intervals.
+agents and once greedily, always taking the placement with the highest value. The gain is taken
+episode by episode.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 
 import torch
 
-from benchmarks.planning import spread
-from benchmarks.timing import show
+from benchmarks.record import record
+from experiments.rows import Rows, main_of, mean
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning import checkpoint as checkpoints
@@ -22,6 +22,8 @@ from marl_pack.config import Config, from_dict
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
 from marl_pack.training.assembly import make_game
+
+MODELS = ("models/rs.pt", "models/cut_1.pt", "models/cut_2.pt", "models/types125.pt")
 
 
 def greedy(critic: AfterstateCritic) -> Policy:
@@ -34,20 +36,21 @@ def greedy(critic: AfterstateCritic) -> Policy:
     return choose
 
 
-def main() -> None:
-    """Play with each checkpoint and print the table."""
-    options = argparse.ArgumentParser(prog="python -m benchmarks.afterstates")
-    options.add_argument("checkpoints", nargs="+", help="that have a critic of afterstates")
-    options.add_argument("--episodes", type=int, default=1000)
-    options.add_argument("--seed", type=int, default=5, help="of the sequences")
-    chosen = options.parse_args()
+def main() -> int:
+    """Play with each checkpoint that is missing; return the exit status."""
+    rows = Rows("python -m experiments.afterstates", __doc__)
+    add = rows.options.add_argument
+    add("checkpoints", nargs="*", default=MODELS, help="(default: those of models/)")
+    add("--episodes", type=int, default=1000, help="(default: 1000)")
+    add("--seed", type=int, default=5, help="of the sequences (default: 5)")
+    chosen = rows.parse()
     torch.set_num_threads(1)
-    table = []
-    for source in chosen.checkpoints:
+    results = rows.results("afterstates")
+    for source in rows.missing(results, chosen.checkpoints):
         checkpoint = checkpoints.read(source)
         critic = load_afterstate_critic(checkpoint, "cpu")
         if critic is None:
-            options.error(f"{source}: has no critic of afterstates")
+            raise ValueError(f"{source}: has no critic of afterstates")
         config = from_dict(checkpoint["config"])
 
         def game(n: int, first: int, config: Config = config) -> Packing:
@@ -59,14 +62,14 @@ def main() -> None:
             play(policy, game, chosen.episodes).utilization
             for policy in (Loader().policy_of(checkpoint), greedy(critic))
         )
-        table.append([source, f"{checkpoint['items']:,}", spread(agents).lstrip("+"),
-                      spread(values).lstrip("+"), spread(agents - values)])  # fmt: skip
-    show(
-        f"{chosen.episodes} episodes",
-        ["checkpoint", "items", "agents %", "greedy in value %", "agents' gain"],
-        table,
-    )
+        figures = {
+            "episodes": chosen.episodes, "agents": mean(agents), "greedy": mean(values),
+            "gain": mean(agents - values),
+        }  # fmt: skip
+        command = f"python -m experiments.afterstates {source} --episodes {chosen.episodes}"
+        results.put(source, figures, record(command, [chosen.seed]))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_of(main))

@@ -1,0 +1,109 @@
+"""Train with one thing changed, with three seeds each: ``python -m experiments.ablations``.
+
+Every run is short, 80 iterations of 1,024 items with the schedules of learning rate and entropy
+ending there, and is evaluated once, at its end, on 2,000 held-out sequences, the same for all. Runs
+stand in ``--folder`` and are resumed.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import yaml
+
+from benchmarks.record import record
+from experiments.learning_curve import history
+from experiments.rows import Rows, main_of
+from marl_pack import train as training
+from marl_pack.config import parse
+
+BASE = "--config configs/afterstates.yaml"
+"""Options of the settings that every change is made to."""
+SHORT = "--ppo.max_iterations 80 --evaluation.every 80 --evaluation.episodes 2000"
+SEEDS = (0, 1, 2)
+
+
+def both(option: str) -> str:
+    """Return an option of a network for both agents."""
+    return f"--orientation.network.{option} --placement.network.{option}"
+
+
+CHANGES = {
+    "none": "",
+    "no_afterstate_value": both(
+        "planes=[mask,resting_height,waste,feasible_cells,feasible_probability,grounded]"
+    ),
+    "orientation_first": "--orientation.frozen true --orientation.policy first",
+    "placement_dblf": "--placement.frozen true --placement.policy dblf",
+    "joint": "--joint true",
+    "orientation_random": "--orientation.frozen true --orientation.policy random",
+    "placement_random": "--placement.frozen true --placement.policy random",
+    "no_feasible_planes": both("planes=[mask,resting_height,waste,grounded]"),
+    "papers_channels": both("planes=[]"),
+    "clone_max_feasible": " ".join(
+        f"--{agent}.teacher max_feasible --{agent}.teacher_iterations 20"
+        for agent in ("orientation", "placement")
+    ),
+    "beta_0": "--game.beta 0",
+    "entropy_0.005": "--ppo.entropy_coef 0.005",
+    "one_epoch": "--ppo.num_learning_epochs 1",
+    "hull_1": "--game.rule hull_1",
+    "no_orientation_mask": "--game.mask_orientations false "
+    + both("planes=[resting_height,waste,grounded]"),
+}
+"""What is changed, in the order of importance."""
+
+
+def key_of(change: str, seed: int) -> str:
+    """Return the key of a run's row."""
+    return f"{change}, seed {seed}"
+
+
+def train(change: str, seed: int, folder: Path) -> tuple[Path, list[str]]:
+    """Train one run to its end, unless it has got there; return its folder and options.
+
+    Raises:
+        ValueError: if the run in that folder has other settings, or the training failed.
+        KeyboardInterrupt: if it was stopped; the run can be resumed.
+    """
+    run = folder / f"{change}_{seed}"
+    own = [*shlex.split(f"{BASE} {SHORT} {CHANGES[change]}"), "--seed", str(seed)]
+    options = [*own, "--output.name", run.name, "--output.folder", str(folder)]
+    if (run / "latest.pt").is_file():
+        settings = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        if settings != parse(options)[0].to_dict():
+            raise ValueError(f"{run}: was trained with other settings; needs another --folder")
+        options = ["--resume", str(run)]
+    status = training.main(options)
+    if status == 130:
+        raise KeyboardInterrupt
+    if status:
+        raise ValueError(f"{run}: the training ended with status {status}")
+    return run, own
+
+
+def main() -> int:
+    """Train the runs that are missing; return the exit status."""
+    rows = Rows("python -m experiments.ablations", __doc__)
+    add = rows.options.add_argument
+    add("--changes", nargs="+", choices=CHANGES, default=list(CHANGES), help="(default: all)")
+    add("--seeds", nargs="+", type=int, default=SEEDS, help="(default: 0 1 2)")
+    add("--folder", type=Path, default=Path("runs/ablations"), help="of the runs")
+    chosen = rows.parse()
+    results = rows.results("ablations")
+    keys = {key_of(change, seed): (change, seed)
+            for change in chosen.changes for seed in chosen.seeds}  # fmt: skip
+    for key in rows.missing(results, keys):
+        change, seed = keys[key]
+        run, options = train(change, seed, chosen.folder)
+        last = history(run)[-1]
+        figures = {name: float(last[name]) for name in ("utilization", "low", "high", "items")}
+        command = f"python -m marl_pack.train {shlex.join(options)}"
+        results.put(key, {"change": CHANGES[change], **figures}, record(command, [seed]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_of(main))

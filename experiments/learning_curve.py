@@ -1,0 +1,121 @@
+"""Draw utilization against items and time of learning: ``python -m experiments.learning_curve``.
+
+Reads the evaluations of runs (a run's folder, or a file such as models/ has) and draws two panels,
+a line a run with its 95 % interval. Keeps when each run was clearly above other policies, and its
+end. Without runs, it draws both pictures of the docs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from benchmarks.record import ROOT, Results, record, reported
+from experiments.packing import SETS
+from experiments.rows import main_of
+from marl_pack.files import moved_into_place
+
+MODELS = ROOT / "models"
+OTHERS = ("cut_1_first", "cut_1_second", "cut_1_third", "cut_1_fourth", "cut_1", "cut_2_first",
+          "cut_2_second", "cut_2", "types125")  # fmt: skip
+
+
+def history(run: Path) -> Any:
+    """Return the rows of a run's evaluations, as a structured array."""
+    path = run if run.is_file() else run / "evaluations.csv"
+    return np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=float))
+
+
+def name_of(run: Path) -> str:
+    """Return the name of a run's row."""
+    return run.stem if run.is_file() else run.name
+
+
+def levels() -> dict[str, float]:
+    """Return the utilization of others on the published RS sequences, in per cent.
+
+    Raises:
+        ValueError: naming the command, if one has not been measured.
+    """
+    results = Results("packing")
+    ours = {
+        name: 100 * results.row(f"--policy {name} {SETS['RS']}")["utilization"]
+        for name in ("max_feasible", "dblf", "random")
+    }
+    return {"Zhou et al. 2024": reported()["packing"][0]["RS"], **ours}
+
+
+def draw(runs: Iterable[Path], path: Path, others: Mapping[str, float]) -> None:
+    """Draw two panels, over items and over minutes, a line a run with its 95 % interval."""
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
+    for run in runs:
+        rows = history(run)
+        for panel, x in zip(panels, (rows["items"] / 1e6, rows["seconds"] / 60), strict=True):
+            panel.plot(x, 100 * rows["utilization"], label=name_of(run))
+            panel.fill_between(x, 100 * rows["low"], 100 * rows["high"], alpha=0.2)
+    for panel, label in zip(panels, ("million items", "minutes on one core"), strict=True):
+        for name, level in others.items():
+            panel.axhline(level, color="grey", linewidth=0.8, linestyle="--")
+            panel.annotate(f"{name} {level:.1f}", (1, level), xycoords=("axes fraction", "data"),
+                           ha="right", va="bottom", fontsize=8, color="grey")  # fmt: skip
+        panel.set_xlabel(label)
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("utilization, %")
+    panels[0].legend(loc="lower right", bbox_to_anchor=(1, 0.1))
+    with moved_into_place(path) as part:
+        figure.savefig(part, dpi=120)
+
+
+def figures(run: Path, others: Mapping[str, float]) -> dict[str, Any]:
+    """Return when a run was clearly above others, its best evaluation and its last."""
+    rows = history(run)
+
+    def point(row: Any) -> dict[str, float]:
+        half = float(row["high"] - row["low"]) / 2
+        return {"items": int(row["items"]), "minutes": float(row["seconds"]) / 60,
+                "utilization": float(row["utilization"]), "half": half}  # fmt: skip
+
+    above = {}
+    for name, level in others.items():
+        passed = rows[100 * rows["low"] > level]
+        above[name] = point(passed[0]) if len(passed) else None
+    best = rows[np.argmax(rows["utilization"])]
+    return {"episodes": int(rows["episodes"][0]), "above": above, "first": point(rows[0]),
+            "best": point(best), "end": point(rows[-1])}  # fmt: skip
+
+
+def main() -> int:
+    """Draw the pictures and keep the figures; return the exit status."""
+    options = argparse.ArgumentParser(prog="python -m experiments.learning_curve")
+    options.add_argument("runs", nargs="*", type=Path, help="runs' folders, or evaluations' files")
+    options.add_argument("--picture", type=Path, default=Path("learning_curve.png"),
+                         help="of the runs")  # fmt: skip
+    chosen = options.parse_args()
+    if chosen.runs:
+        draw(chosen.runs, chosen.picture, {})
+        for run in chosen.runs:
+            print(run, figures(run, {}))
+        return 0
+    others = levels()
+    draw([MODELS / "rs.csv"], ROOT / "docs" / "learning_curve.png", others)
+    rest = [MODELS / f"{name}.csv" for name in OTHERS]
+    draw(rest, ROOT / "docs" / "learning_curve_others.png", {})
+    made = record("python -m experiments.learning_curve")
+    results = Results("learning_curve")
+    for run in (MODELS / "rs.csv", *rest):
+        own = figures(run, others if run.stem == "rs" else {})
+        results.put(run.stem, own, made)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_of(main))

@@ -1,0 +1,163 @@
+"""Measure how well policies pack: ``python -m experiments.packing``.
+
+Three tables: ``packing``, policies on four sets of items; ``other_rules``, heuristics under every
+stability rule; ``bodies``, what falls in physics where a rule's assumptions do not hold. A row is
+a command of ``marl_pack.evaluate``. With ``--physics`` the packings are judged too, which takes
+most of the time; the table ``bodies`` is always judged.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from benchmarks.record import ROOT, Results, record
+from experiments.rows import Rows, expanded, main_of
+from marl_pack import evaluate
+from marl_pack.evaluation.rollout import play
+from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
+from marl_pack.options import Setup, choose, set_threads
+from marl_pack.plan import Plan
+from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.sapien_check.judge import judge_all
+from marl_pack.stability import RULES
+from marl_pack.terminal import make_console, make_progress
+
+SETS = {
+    "RS": "--items $MARL_PACK_DATA/rs.npz",
+    "CUT-1": "--items $MARL_PACK_DATA/cut_1.npz",
+    "CUT-2": "--items cut2 --episodes 2100 --seed 0",
+    "125 types": "--items rs --sides 1 5 --episodes 2100 --seed 0",
+}
+MODELS = {
+    "RS": ("models/rs.pt", "models/rs.pt --symmetric"),
+    "CUT-1": ("models/rs.pt", "models/cut_1.pt"),
+    "CUT-2": ("models/rs.pt", "models/cut_2.pt"),
+    "125 types": ("models/rs.pt", "models/types125.pt"),
+}
+HEURISTICS = ("max_feasible", "dblf", "height_min", "best_fit", "random")
+TABLES = {
+    "packing": [
+        f"--policy {policy} {items}"
+        for name, items in SETS.items()
+        for policy in (*MODELS[name], *HEURISTICS)
+    ],
+    "other_rules": [
+        f"--policy {policy} {SETS['RS']} --rule {rule}"
+        for rule in RULES
+        if rule != "none"
+        for policy in ("dblf", "random")
+    ],
+    "bodies": [
+        f"--policy dblf --items rs --episodes {episodes} --seed 1{options}"
+        for episodes, options in (
+            (1000, ""),
+            (1000, " --rule none"),
+            (300, " --density 100 1000 --com-spread 0.2"),
+            (1000, " --density 100 1000 --com-spread 0.2 --margin 0.99"),
+            (1000, " --density 100 1000 --com-spread 0.2 --margin 1.42"),
+        )
+    ],
+}
+KEPT = ROOT / "runs" / "packing"
+"""The folder of the plans that are still to be judged."""
+PART = 50
+"""How many packings are judged before the figures are written."""
+
+
+def measure(results: Results, key: str, physics: bool, processes: int) -> None:
+    """Play the policy of a row and judge its packings, unless that is done.
+
+    Args:
+        results: the table.
+        key: options of ``marl_pack.evaluate``, without ``--physics``.
+        physics: whether to judge.
+        processes: that judge at once.
+    """
+    console = make_console()
+    options = expanded(key) + ["--physics", "--processes", str(processes)] * physics
+    arguments = evaluate.parser().parse_args(options)
+    set_threads(arguments.threads)
+    setup = choose(arguments, console)
+    episodes, bodies = evaluate.check_options(arguments, setup)
+    command = f"python -m marl_pack.evaluate {key}" + " --physics" * physics
+    row = results.rows().get(key)
+    plans_file = KEPT / f"{re.sub(r'[^A-Za-z0-9.]+', '_', key).strip('_')}.npz"
+    with make_progress(console) as bar:
+        plans: list[Plan] | None = None
+        if row is None or (physics and not plans_file.is_file() and not judged(row)):
+            figures, plans = packed(setup, episodes, bar)
+            row = {**figures, **(row or {})}
+            save_plans(plans_file, plans)
+            results.put(key, row, record(command, [arguments.seed], arguments.threads))
+        if bodies is None or judged(row):
+            return
+        plans = plans or load_plans(plans_file)
+        task = bar.add_task("judged", total=episodes, completed=row.get("judged_episodes", 0))
+        for first in range(row.get("judged_episodes", 0), episodes, PART):
+            part = range(first, min(first + PART, episodes))
+            verdicts = falls(list(judge_all(bodies.stacks(plans, part), processes=processes)))
+            row = joined(row, verdicts)
+            results.put(key, row, record(command, [arguments.seed], arguments.threads))
+            bar.advance(task, len(part))
+    plans_file.unlink()
+
+
+def packed(setup: Setup, episodes: int, bar: Progress) -> tuple[dict[str, Any], list[Plan]]:
+    """Return the figures of a policy's packings, and the packings."""
+    [(name, policy)] = setup.policies.items()
+    task = bar.add_task(f"{name}: episodes", total=episodes)
+    start = time.process_time()
+    rollout = play(policy, setup.game, episodes, lambda ended: bar.advance(task, ended))
+    seconds = time.process_time() - start
+    solving = bar.add_task("equilibria", total=episodes)
+    balanced = np.empty(episodes, np.bool_)
+    for e, plan in enumerate(rollout.plans):
+        balanced[e] = strict_equilibrium(plan)
+        bar.advance(solving)
+    figures = summary(rollout, balanced)
+    figures["cpu_seconds"] = seconds  # of the game and the policy
+    del figures["decisions_per_second"]  # by the clock
+    return figures, rollout.plans
+
+
+def judged(row: dict[str, Any]) -> bool:
+    """Return whether all packings of a row have been judged."""
+    return bool(row.get("judged_episodes") == row["episodes"])
+
+
+def joined(row: dict[str, Any], verdicts: dict[str, Any]) -> dict[str, Any]:
+    """Return a row with the verdicts on more of its packings."""
+    counts = ("falls", "no_verdict", "judged_episodes", "judged")
+    sums = {name: row.get(name, 0) + verdicts[name] for name in counts}
+    seconds = sum(r.get("judged", 0) * r.get("judge_seconds", 0) for r in (row, verdicts))
+    return row | sums | {"judge_seconds": seconds / max(sums["judged"], 1)}
+
+
+def main() -> int:
+    """Measure what is missing of the chosen tables; return the exit status."""
+    rows = Rows("python -m experiments.packing", __doc__)
+    add = rows.options.add_argument
+    add("--tables", nargs="+", choices=TABLES, default=list(TABLES), help="(default: all)")
+    add("--physics", action="store_true", help="judge the packings of every table")
+    add("--processes", type=int, default=1, help="that judge at once (default: 1)")
+    chosen = rows.parse()
+    KEPT.mkdir(parents=True, exist_ok=True)
+    for table in chosen.tables:
+        results, physics = rows.results(table), chosen.physics or table == "bodies"
+
+        def done(row: dict[str, Any], physics: bool = physics) -> bool:
+            return judged(row) or not physics
+
+        for key in rows.missing(results, TABLES[table], done):
+            measure(results, key, physics, chosen.processes)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_of(main))
