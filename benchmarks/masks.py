@@ -1,18 +1,16 @@
 """Time the masks of the stability rules: ``python -m benchmarks.masks``.
 
-1. One mask at 120 × 120 beside a literal reading of Algorithm 1: a loop over windows with
-   ``cv2.convexHull`` and ``cv2.pointPolygonTest``. Timed is its cheapest reading, a point for each
-   cell; the masks are compared with the reading of marl_pack, the cells' squares.
+1. One mask at 120 × 120 beside the paper's Algorithm 1 as it is printed
+   (:mod:`marl_pack.stability.paper`). Timed is its cheapest reading, a point for each cell; the
+   masks are compared with the reading of marl_pack, the cells' squares.
 2. Batched masks at 10 × 10, on every device.
 3. Cost against the grid's size.
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from benchmarks.states import LARGE, SMALL, in_play, random_items
 from benchmarks.timing import best_time, devices, show
@@ -24,48 +22,7 @@ from marl_pack.stability import (
     make_rule,
     orient_item,
 )
-from marl_pack.stability.reference import corners
-
-
-def literal_algorithm_1(
-    heightmap: NDArray[np.int16],
-    empty_map: NDArray[np.int16],
-    item: tuple[int, int, int],
-    height: int,
-    squares: bool,
-) -> NDArray[np.bool_]:
-    """Compute the mask of Algorithm 1, window by window, with OpenCV.
-
-    Args:
-        heightmap: [W, D].
-        empty_map: [W, D].
-        item: w, d, h.
-        height: H.
-        squares: whether the hull is that of the contact cells' squares (and inclusion strict), or
-            of the cells' indices as points (and the edge counts), as the paper may be read.
-    """
-    w, d, h = item
-    mask = np.zeros(heightmap.shape, np.bool_)
-    for x in range(heightmap.shape[0] - w + 1):
-        for y in range(heightmap.shape[1] - d + 1):
-            window = heightmap[x : x + w, y : y + d]
-            top = window.max()
-            if top + h > height:
-                continue
-            if top == 0:
-                mask[x, y] = True
-                continue
-            bearing = (window == top) & (empty_map[x : x + w, y : y + d] == 0)
-            if not bearing.any():
-                continue
-            if squares:
-                points, centre = (2 * corners(bearing)).astype(np.int32), (float(w), float(d))
-            else:
-                points, centre = np.argwhere(bearing).astype(np.int32), (w / 2, d / 2)
-            hull = cv2.convexHull(points)
-            side = cv2.pointPolygonTest(hull, centre, False)
-            mask[x, y] = side > 0 if squares else side >= 0
-    return mask
+from marl_pack.stability.paper import convex_hull_alpha
 
 
 def against_the_literal_reading(states: int = 32) -> None:
@@ -80,9 +37,9 @@ def against_the_literal_reading(states: int = 32) -> None:
         bins, item = game.bins[one], OrientedItem(items[one][:, None])
         sides_b = tuple(items[b].tolist())
         inputs = (heights[b], empty_maps[b], sides_b, size[2])
-        exact = literal_algorithm_1(*inputs, squares=True)
+        exact = convex_hull_alpha(*inputs, reading="squares")
         assert (hull_alpha(bins, item)[0, 0].numpy() == exact).all()
-        seconds["literal"] += best_time(lambda i=inputs: literal_algorithm_1(*i, squares=False), 2)  # type: ignore[misc]  # bound now
+        seconds["literal"] += best_time(lambda i=inputs: convex_hull_alpha(*i), 2)  # type: ignore[misc]  # bound now
         seconds["mask"] += best_time(lambda b=bins, i=item: hull_alpha(b, i))  # type: ignore[misc]  # bound now
         levels = np.empty((1, *size[:2]), hull_compiled.level_dtype(size[2]))
         out = np.empty((1, 1, *size[:2]), np.uint8)

@@ -4,14 +4,13 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from conftest import boxes_of, off_centre, random_maps, random_play, some_items
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_backends import PLACES, expected
+from test_backends import PLACES
 
 from marl_pack import bins as state
 from marl_pack.backend import Backend
@@ -30,6 +29,7 @@ from marl_pack.stability import (
     reference,
     stable_mask,
 )
+from marl_pack.stability.paper import convex_hull_alpha
 from marl_pack.stability.reduced_equilibrium import UNSURE
 from marl_pack.stability.static_equilibrium import least_force
 
@@ -43,17 +43,12 @@ def test_hull_alpha_equals_opencvs_hull_of_the_squares_corners(
     bins = random_maps(12, size, sides, 12, seed=7)
     item = orient_item(some_items(12, sides, 8))
 
-    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
-        heights = bins.heightmap[b, x : x + w, y : y + d].numpy()
-        contact = (heights == heights.max()) & (
-            bins.empty_map[b, x : x + w, y : y + d].numpy() == 0
-        )
-        if not contact.any():
-            return False
-        points = (2 * reference.corners(contact)).astype(np.int32)  # half cells are whole
-        return cv2.pointPolygonTest(cv2.convexHull(points), (float(w), float(d)), False) > 0
-
-    assert (hull_alpha(bins, item).numpy() == expected(bins, item, stands)).all()
+    masks = hull_alpha(bins, item).numpy()
+    for b, oriented in enumerate(item.sides.tolist()):
+        maps = bins.heightmap[b].numpy(), bins.empty_map[b].numpy()
+        for a, sides_a in enumerate(oriented):
+            expected = convex_hull_alpha(*maps, tuple(sides_a), bins.height, "squares")
+            assert (masks[b, a] == expected).all()
 
 
 @settings(max_examples=200, deadline=None)
