@@ -23,7 +23,7 @@ from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
 from marl_pack.training.assembly import make_game
 
-MODELS = ("models/rs.pt", "models/cut_1.pt", "models/cut_2.pt", "models/types125.pt")
+MODELS = ("rs", "cut_1", "cut_2", "types125")
 
 
 def greedy(critic: AfterstateCritic) -> Policy:

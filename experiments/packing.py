@@ -35,10 +35,10 @@ SETS = {
     "125 types": "--items rs --sides 1 5 --episodes 2100 --seed 0",
 }
 MODELS = {
-    "RS": ("models/rs.pt", "models/rs.pt --symmetric"),
-    "CUT-1": ("models/rs.pt", "models/cut_1.pt"),
-    "CUT-2": ("models/rs.pt", "models/cut_2.pt"),
-    "125 types": ("models/rs.pt", "models/types125.pt"),
+    "RS": ("rs", "rs --symmetric"),
+    "CUT-1": ("rs", "cut_1"),
+    "CUT-2": ("rs", "cut_2"),
+    "125 types": ("rs", "types125"),
 }
 HEURISTICS = ("max_feasible", "dblf", "height_min", "best_fit", "random")
 TABLES = {

@@ -33,7 +33,7 @@ def main() -> int:
     """Play with each plan that is missing; return the exit status."""
     rows = Rows("python -m experiments.planning", __doc__)
     add = rows.options.add_argument
-    add("--checkpoint", default="models/rs.pt", help="(default: models/rs.pt)")
+    add("--checkpoint", default="rs", help="(default: rs)")
     add("--plans", nargs="+", default=PLANS, metavar="rollouts=K,top=M,depth=D")
     add("--episodes", type=int, default=400, help="(default: 400)")
     add("--seed", type=int, default=5, help="of the sequences (default: 5)")

@@ -30,7 +30,7 @@ from marl_pack.items import Stream, choose_stream
 mpl.use("Agg")
 from matplotlib import pyplot as plt  # once it is known that nothing is shown
 
-POLICIES = ("models/rs.pt", "max_feasible", "dblf")
+POLICIES = ("rs", "max_feasible", "dblf")
 GROUPS = 8
 
 
