@@ -276,6 +276,7 @@ def test_a_bound_rule_is_checked_like_a_named_one() -> None:
         ({"heightmap": [[7, 0], [0, 0]]}, "heights must lie in 0 … 6"),
         ({"heightmap": [0, 0]}, "same shape"),
         ({"empty_map": [[1, 0], [0, 0]]}, "empty_map"),
+        ({"empty_map": None}, "empty_map: needs .* zeros if every column is filled"),
         ({"bin_height": 0}, "bin size"),
         ({"com_offset": (0.5, 0, 0)}, "com_offset"),
         ({"weight": -2.0}, "weight"),

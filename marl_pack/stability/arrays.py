@@ -36,7 +36,8 @@ def stable_mask(
     Args:
         rule: a name in :data:`RULES`, or a rule from :func:`make_rule`.
         heightmap: whole numbers [W, D], top of each column in cells.
-        empty_map: whole numbers [W, D], empty cells below each top (Algorithm 2).
+        empty_map: whole numbers [W, D], empty cells below the top of each column (Algorithm 2); 0
+            where the column is filled down to the floor. A heightmap alone does not show them.
         item: w, d, h along x, y, z, in cells.
         bin_height: H in cells.
         boxes: rows x, y, z, w, d, h of the boxes in the bin; ``lbcp`` and ``equilibrium`` need
@@ -113,6 +114,11 @@ def _check_maps(
     Raises:
         ValueError: if their shapes differ, or a number in them or the bin's size is impossible.
     """
+    if empty_map is None:
+        raise ValueError(
+            "empty_map: needs whole numbers [W, D], the empty cells below the top of each column; "
+            "zeros if every column is filled down to the floor"
+        )
     heights = whole_cells("heightmap", heightmap)
     empty = whole_cells("empty_map", empty_map)
     if heights.ndim != 2 or heights.shape != empty.shape:
