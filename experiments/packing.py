@@ -21,9 +21,9 @@ from experiments.rows import Rows, expanded, main_of
 from marl_pack import evaluate
 from marl_pack.evaluation.rollout import play
 from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
-from marl_pack.options import Setup, choose, set_threads
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.players import Setup, choose, set_threads
 from marl_pack.sapien_check.judge import judge_all
 from marl_pack.stability import RULES
 from marl_pack.terminal import make_console, make_progress

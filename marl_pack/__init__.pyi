@@ -1,7 +1,7 @@
 # The public interface: __init__.py imports these names at their first use.
 
-from .agents.heuristics import POLICIES as POLICIES
 from .agents.heuristics import make_policy as make_policy
+from .agents.keys import POLICIES as POLICIES
 from .agents.loading import Loader as Loader
 from .agents.policy import Policy as Policy
 from .agents.search import Planner as Planner

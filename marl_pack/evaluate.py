@@ -12,7 +12,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -20,18 +20,21 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from marl_pack.agents.policy import Policy
 from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
 from marl_pack.files import Growing, check_writable, same_plain_file, write_json
-from marl_pack.options import EPILOG, MOST_AT_ONCE, Setup, add_options, choose, set_threads
+from marl_pack.options import EPILOG, MOST_AT_ONCE, add_options
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, judge_all
 from marl_pack.sapien_check.world import SimulationError, load_sapien
 from marl_pack.terminal import PIPED_WIDTH, Parser, make_console, make_progress
+
+if TYPE_CHECKING:
+    from marl_pack.agents.policy import Policy
+    from marl_pack.players import Setup
 
 EPISODES = 1000  # of a generated stream, unless --episodes is given
 
@@ -195,6 +198,9 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
+    from marl_pack.players import choose, set_threads  # what plays is slow to import
+
+    set_threads(arguments.threads)
     setup = choose(arguments, console)
     episodes, bodies = check_options(arguments, setup)
     bar = make_progress(console)
@@ -225,7 +231,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser()
     chosen = options.parse_args(arguments)
     try:
-        set_threads(chosen.threads)
         run(chosen, make_console())
     except SimulationError as error:  # a process of the judge has died
         options.exit(1, f"{options.prog}: {error}")

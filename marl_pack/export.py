@@ -27,9 +27,9 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import load_actor, load_afterstate_critic
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.extras import missing
 from marl_pack.files import write_atomically
 from marl_pack.game.packing import Packing
-from marl_pack.installation import missing
 from marl_pack.terminal import Parser, make_console
 
 OPSET = 18

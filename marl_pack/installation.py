@@ -1,4 +1,4 @@
-"""Settle what depends on the installation: the cache of compiled code, and optional packages."""
+"""Compile functions by Numba, with a cache on disk where the installation allows it."""
 
 from __future__ import annotations
 
@@ -65,16 +65,3 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Any], Any]:
         return compiled
 
     return decorate
-
-
-def missing(error: ModuleNotFoundError, what: str, extra: str) -> ModuleNotFoundError:
-    """Return the error that an optional package is missing, with the command that installs it.
-
-    Args:
-        error: of the import.
-        what: names what needs the package, and the package.
-        extra: of ``pyproject.toml`` that has it.
-    """
-    return ModuleNotFoundError(
-        f'{error}: {what}; run pip install -e ".[{extra}]" in marl_pack\'s source'
-    )

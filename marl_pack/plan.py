@@ -13,17 +13,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.bins import Bins
 from marl_pack.checks import decimals, number_in, real_number, whole_number
 from marl_pack.files import write_atomically, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
 from marl_pack.items.names import check_names
+
+if TYPE_CHECKING:
+    from marl_pack.bins import Bins
 
 Array = NDArray[Any]
 

@@ -17,7 +17,7 @@ from rich.table import Table
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.options import EPILOG, add_options, choose, set_threads
+from marl_pack.options import EPILOG, add_options
 from marl_pack.plan import Plan
 from marl_pack.terminal import Parser, make_console
 
@@ -46,6 +46,9 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     if chosen.picture.suffix.lower() != ".png":
         raise ValueError(f"--picture {chosen.picture}: needs the ending .png")
     check_writable(chosen.picture)
+    from marl_pack.players import choose, set_threads  # what plays is slow to import
+
+    set_threads(chosen.threads)
     setup = choose(chosen, console)
     if len(setup.policies) > 1:
         raise ValueError("--policy: needs one policy; marl_pack.evaluate compares several")
@@ -95,7 +98,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser()
     chosen = options.parse_args(arguments)
     try:
-        set_threads(chosen.threads)
         run(chosen, make_console())
     except KeyboardInterrupt:
         options.exit(130, f"{options.prog}: interrupted")

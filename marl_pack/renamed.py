@@ -15,7 +15,7 @@ PLANES = {
 """Input planes of the networks (:data:`marl_pack.agents.networks.planes.PLANES`)."""
 
 POLICIES = {"most_room": "max_feasible"}
-"""Names of heuristics (:data:`marl_pack.agents.heuristics.POLICIES`)."""
+"""Names of heuristics (:data:`marl_pack.agents.keys.POLICIES`)."""
 
 AGENT_KEYS = {"imitate": "teacher", "imitate_iterations": "teacher_iterations"}
 """Settings of an agent (:class:`marl_pack.config.Agent`)."""

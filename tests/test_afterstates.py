@@ -14,7 +14,8 @@ from marl_pack.agents.afterstates import critic as critics
 from marl_pack.agents.afterstates import lookahead as lookaheads
 from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
 from marl_pack.agents.afterstates.features import FEATURES, features
-from marl_pack.agents.afterstates.lookahead import ILLEGAL, Lookahead
+from marl_pack.agents.afterstates.limits import ILLEGAL
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints

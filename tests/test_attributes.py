@@ -10,7 +10,8 @@ from torch import Tensor
 
 from marl_pack import env_aec
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.heuristics import POLICIES, make_policy
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.search import SearchSettings

@@ -20,9 +20,9 @@ from marl_pack.stability import (
     make_rule,
     orient_item,
     reference,
-    support_area,
 )
 from marl_pack.stability.load_bearing import lbcp_bearing
+from marl_pack.stability.parameters import check_thresholds
 
 PLACES = [((5, 5, 6), (1, 4)), ((7, 4, 9), (1, 5)), ((10, 10, 10), (2, 5)), ((3, 8, 200), (1, 7))]
 LARGE_SIZES = [(10, 10, 10), (40, 30, 50), (33, 64, 300)]
@@ -170,7 +170,7 @@ def test_area_masks_equal_the_reference(
 ) -> None:
     bins = replace(random_maps(12, size, sides, 12, seed=4), backend=backend)
     item = orient_item(some_items(12, sides, 5))
-    pairs = support_area.check_thresholds(thresholds)
+    pairs = check_thresholds(thresholds)
 
     def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
         return reference.area_ratio(bins.heightmap[b, x : x + w, y : y + d].numpy(), pairs)

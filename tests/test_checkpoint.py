@@ -13,7 +13,7 @@ from marl_pack.agents.search import SearchSettings
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
-from marl_pack.options import with_search
+from marl_pack.players import with_search
 from marl_pack.train import main as train
 
 

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "checks", "files", "inputs", "installation", "published", "renamed",
+    ("backend", "checks", "extras", "files", "inputs", "installation", "published", "renamed",
      "terminal"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
@@ -18,13 +18,13 @@ LAYERS = (
     ("env_aec", "vec_env", "agents"),
     ("evaluation",),
     # The programs, and what only they use.
-    ("config", "evaluate", "export", "integrations", "options", "physics", "play", "train",
-     "training"),
+    ("config", "evaluate", "export", "integrations", "options", "physics", "play", "players",
+     "train", "training"),
 )  # fmt: skip
 
 # What the judge and the environment must not need.
 ONLY = {
-    "sapien_check": {"bins", "checks", "files", "geometry", "installation", "plan", "sapien_check"},
+    "sapien_check": {"bins", "checks", "extras", "files", "geometry", "plan", "sapien_check"},
     "env_aec": {"bins", "checks", "game", "geometry", "installation", "items", "plan", "render"},
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
              "renamed", "stability"},

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from marl_pack.installation import missing
+from marl_pack.extras import missing
 
 PACKAGE = Path(__file__).parent.parent / "marl_pack"
 

@@ -8,13 +8,15 @@ from conftest import in_play
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic
-from marl_pack.agents.afterstates.lookahead import ILLEGAL, Lookahead
+from marl_pack.agents.afterstates.limits import ILLEGAL
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice, observe
 from marl_pack.agents.networks.planes import PLANES, channel_names, input_channels
+from marl_pack.agents.networks.shape import Network
 from marl_pack.agents.networks.symmetry import transform
-from marl_pack.agents.networks.trunk import Network, Trunk, widen
+from marl_pack.agents.networks.trunk import Trunk, widen
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS
 

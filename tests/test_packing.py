@@ -4,7 +4,8 @@ import torch
 from conftest import boxes_of, in_play
 
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.heuristics import HEURISTICS, POLICIES, make_policy
+from marl_pack.agents.heuristics import HEURISTICS, make_policy
+from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.policy import draw
 from marl_pack.backend import Backend
 from marl_pack.game.moves import Floor, Moves

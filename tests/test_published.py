@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from marl_pack import published
-from marl_pack.agents.heuristics import ORIENTATION_AGENTS
+from marl_pack.agents.keys import ORIENTATION_AGENTS
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.config import ConfigError, parse
 from marl_pack.evaluate import main as evaluate

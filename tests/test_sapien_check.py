@@ -465,7 +465,7 @@ def test_the_judge_imports_nothing_that_packs() -> None:
         for name in re.findall(r"^ *from marl_pack\.([\w.]+) import", path.read_text(), re.M)
     }  # fmt: skip
     assert {name.split(".")[0] for name in imported} <= {
-        "bins", "checks", "geometry", "installation", "plan", "files", "sapien_check"
+        "bins", "checks", "extras", "geometry", "plan", "files", "sapien_check"
     }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.networks.actor_critic import make_actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.agents.networks.planes import PLANES
+from marl_pack.agents.networks.shape import Network
 from marl_pack.agents.networks.symmetry import (
     count,
     mean_probabilities,
@@ -20,7 +21,6 @@ from marl_pack.agents.networks.symmetry import (
     mirror_observation,
     transform,
 )
-from marl_pack.agents.networks.trunk import Network
 from marl_pack.game.packing import Packing
 
 SIZE = (6, 6, 8)

@@ -9,7 +9,7 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.distribution import check_outputs
 from marl_pack.agents.networks.kinds import observe
-from marl_pack.agents.networks.planes import Observation
+from marl_pack.agents.networks.sight import Observation
 from marl_pack.agents.networks.symmetry import mean_probabilities
 from marl_pack.game.packing import Packing
 

@@ -14,12 +14,11 @@ from marl_pack import published, renamed
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.lookahead import Lookahead, Memo
 from marl_pack.agents.heuristics import (
-    ORIENTATION_AGENTS,
-    POLICIES,
     make_orientation_agent,
     make_placement_agent,
     make_policy,
 )
+from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.form import check_alike
@@ -63,7 +62,7 @@ class Loader:
         """Return the policy that ``source`` names.
 
         Args:
-            source: one of :data:`marl_pack.agents.heuristics.POLICIES`, a published model's name
+            source: one of :data:`marl_pack.agents.keys.POLICIES`, a published model's name
                 (:mod:`marl_pack.published`), or the path of a run's folder or a checkpoint.
 
         Raises:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from marl_pack.agents.heuristics import POLICIES
-from marl_pack.agents.networks.trunk import Network
+from marl_pack.agents.keys import POLICIES
+from marl_pack.agents.networks.shape import Network
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.items import DEFAULT_SIDES
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.agents.policy import Policy
 from marl_pack.checks import whole_number
-from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
+
+if TYPE_CHECKING:
+    from marl_pack.agents.policy import Policy
+    from marl_pack.game.packing import Packing
 
 BATCH = 1024  # games played at once, at most
 BATCH_CELLS = 1 << 20  # cells in the maps of their bins, at most

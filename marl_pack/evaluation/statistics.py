@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from marl_pack.evaluation.rollout import Rollout
 from marl_pack.plan import Plan
 from marl_pack.sapien_check.judge import Judged
-from marl_pack.stability import in_equilibrium
 
 FEWEST = 10
 """Number of episodes from which a mean has an interval: with fewer, Student's says nothing."""
@@ -24,6 +22,8 @@ def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
         return None
     if np.ptp(values) == 0:  # Student's would be NaN
         return float(values[0]), float(values[0])
+    from scipy import stats  # slow to import
+
     bounds = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
     return float(bounds.low), float(bounds.high)
 
@@ -82,6 +82,8 @@ def strict_equilibrium(plan: Plan) -> bool:
     Raises:
         ValueError: unless lengths are whole numbers, which the contacts of faces need.
     """
+    from marl_pack.stability import in_equilibrium
+
     if plan.sides.dtype.kind != "i":
         raise ValueError("the plan has fractions of a unit: needs whole numbers, scale it")
     bins = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]

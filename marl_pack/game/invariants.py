@@ -26,8 +26,8 @@ from marl_pack.stability import RULES, reference
 from marl_pack.stability.centres import exact
 from marl_pack.stability.equilibrium_masks import shifts_of
 from marl_pack.stability.exact_equilibrium import Load
+from marl_pack.stability.parameters import check_thresholds
 from marl_pack.stability.static_equilibrium import stands as stack_stands
-from marl_pack.stability.support_area import check_thresholds
 
 VARIABLE = "MARL_PACK_CHECK"
 """Name of the environment variable that switches the mode on (1) or off (0, the default)."""

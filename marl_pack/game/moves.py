@@ -19,10 +19,9 @@ from torch import Tensor
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
 from marl_pack.game.spec import GameSpec
-from marl_pack.geometry import ORIENTATIONS, orientation_table
+from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS, orientation_table
 from marl_pack.installation import njit
 from marl_pack.items import Items
-from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.stability import OrientedItem, orient_item
 
 Numbers = TypeVar("Numbers", int, Tensor, NDArray[np.int64])

@@ -30,8 +30,8 @@ from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides
 from marl_pack.game.spec import GameSpec, document
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
+from marl_pack.geometry import ALL_ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
-from marl_pack.items.items import ALL_ORIENTATIONS
 from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
 

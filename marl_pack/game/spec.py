@@ -18,11 +18,9 @@ from typing import Any, TypeVar
 
 from marl_pack import renamed
 from marl_pack.checks import real_number, shown, truth_value
-from marl_pack.geometry import check_size
-from marl_pack.items.items import ALL_ORIENTATIONS
+from marl_pack.geometry import ALL_ORIENTATIONS, check_size
 from marl_pack.stability import RULES, Rule, make_rule
-from marl_pack.stability.oriented_item import NO_OFFSET, check_com_offset
-from marl_pack.stability.support_area import THRESHOLDS
+from marl_pack.stability.parameters import NO_OFFSET, THRESHOLDS, check_com_offset
 
 T = TypeVar("T")
 NOTHING_TAKEN: Mapping[str, str] = MappingProxyType({})

@@ -8,24 +8,6 @@ the top of each column, an empty map [W, D] the empty cells below that top. The 
 compiled loops and as batched tensor code.
 """
 
-from marl_pack.geometry.boxes import (
-    MAX_HEIGHT,
-    MAX_SIDE,
-    ORIENTATIONS,
-    Size,
-    check_size,
-    orientation_table,
-    oriented,
-)
-from marl_pack.geometry.windows import resting_heights_and_waste
+import lazy_loader
 
-__all__ = [
-    "MAX_HEIGHT",
-    "MAX_SIDE",
-    "ORIENTATIONS",
-    "Size",
-    "check_size",
-    "orientation_table",
-    "oriented",
-    "resting_heights_and_waste",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

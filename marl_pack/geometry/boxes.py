@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
-import torch
-from torch import Tensor
-
 from marl_pack.checks import real_number, shown
 
 Size = tuple[int, int, int]
@@ -24,6 +19,9 @@ ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
 (0 = w, 1 = d, 2 = h) lies along x, y and z. ``o // 2`` picks the side that stands upright
 (h, d, w), and ``o ^ 1`` is the same box rotated by 90° about the vertical. So 0 is the item as
 it comes, and {0, 1} are the two orientations that keep it upright."""
+
+ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
+"""Numbers of the six orientations."""
 
 MAX_HEIGHT = 16383
 """Height of the tallest bin in cells: masks compare ``2 · height + 1`` as 16-bit integers."""
@@ -49,14 +47,3 @@ def check_size(size: Size) -> Size:
             "cells"
         )
     return int(sides[0]), int(sides[1]), int(sides[2])
-
-
-@cache
-def orientation_table(device: torch.device) -> Tensor:
-    """Return :data:`ORIENTATIONS` as int64 [6, 3] on ``device``."""
-    return torch.tensor(ORIENTATIONS, device=device)
-
-
-def oriented(items: Tensor) -> Tensor:
-    """Return the items' sides (w, d, h) [..., 3] in their six orientations [..., 6, 3]."""
-    return items[..., orientation_table(items.device)]

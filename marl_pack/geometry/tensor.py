@@ -6,8 +6,23 @@ a window of its own for each map.
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
+
+from marl_pack.geometry.boxes import ORIENTATIONS
+
+
+@cache
+def orientation_table(device: torch.device) -> Tensor:
+    """Return :data:`ORIENTATIONS` as int64 [6, 3] on ``device``."""
+    return torch.tensor(ORIENTATIONS, device=device)
+
+
+def oriented(items: Tensor) -> Tensor:
+    """Return the items' sides (w, d, h) [..., 3] in their six orientations [..., 6, 3]."""
+    return items[..., orientation_table(items.device)]
 
 
 def footprint(width: int, depth: int, sides: Tensor, corners: Tensor) -> Tensor:

@@ -14,9 +14,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.checks import shown
-from marl_pack.geometry import ORIENTATIONS, Size
+from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS, Size
 from marl_pack.items.items import (
-    ALL_ORIENTATIONS,
     ATTRIBUTES,
     KEYS,
     UPRIGHT,

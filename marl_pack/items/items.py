@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_pack.checks import decimals, number_in, real_number
-from marl_pack.geometry import ORIENTATIONS
+from marl_pack.geometry import ALL_ORIENTATIONS
 
-ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
-"""Numbers of the six orientations, :data:`marl_pack.geometry.ORIENTATIONS`."""
 UPRIGHT = (0, 1)
 """Orientations in which the item's own height stays vertical: this side up."""
 

@@ -14,15 +14,10 @@ from marl_pack.geometry import Size, check_size
 from marl_pack.items.checking import check_items
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import check_fields, read_fields
+from marl_pack.items.generated import DEFAULT_SIDES, GENERATED
 from marl_pack.items.items import Items
 from marl_pack.items.sequences import Sequences
 from marl_pack.items.streams import Cut, Stream, Uniform
-
-GENERATED = ("rs", "cut1", "cut2")
-"""Names of the streams that need no file."""
-
-DEFAULT_SIDES = (2, 5)
-"""Shortest and longest side of a generated item: the 64 types {2..5}³ of RS and CUT."""
 
 MEMBERS = tuple(name for name in vars(Stream) if not name.startswith("_"))
 """Names of the members of a stream."""

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from marl_pack.backend import Backend, default_backend
-from marl_pack.geometry import Size
+from marl_pack.geometry import ALL_ORIENTATIONS, Size
 from marl_pack.installation import njit
 from marl_pack.items.cutting import cut
-from marl_pack.items.items import ALL_ORIENTATIONS, Items, join
+from marl_pack.items.items import Items, join
 from marl_pack.items.random_numbers import GOLDEN, below, draw, episode_keys, mix
 from marl_pack.items.sequences import Sequences
 

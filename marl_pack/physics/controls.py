@@ -18,7 +18,6 @@ from marl_pack.plan import Plan
 from marl_pack.sapien_check.judge import check
 from marl_pack.sapien_check.stack import DENSITY, Stack
 from marl_pack.sapien_check.world import DEFAULT, Physics
-from marl_pack.stability import in_equilibrium
 
 MARGINS = (1.0, 0.2, -0.2, -1.0)
 """Millimetres inside the support at which every family is judged."""
@@ -32,6 +31,8 @@ BIN = (1000.0, 1000.0, 2000.0)  # millimetres, so that no wall is near
 
 def exact_equilibrium(plan: Plan) -> bool:
     """Return whether a plan in millimetres is in strict static equilibrium, to 1/1000 mm."""
+    from marl_pack.stability import in_equilibrium
+
     boxes = np.rint(plan.boxes * SCALE).astype(np.int64)
     weights = plan.weights / plan.weights.mean()
     return in_equilibrium(boxes, np.column_stack((weights, plan.centres * SCALE)))

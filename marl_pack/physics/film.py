@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from marl_pack.extras import missing
 from marl_pack.files import check_writable, moved_into_place
-from marl_pack.installation import missing
 from marl_pack.render.picture import PALETTE
 from marl_pack.sapien_check.stack import Floats, Stack
 from marl_pack.sapien_check.world import DEFAULT, Pass, Physics, World

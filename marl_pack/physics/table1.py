@@ -12,22 +12,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from itertools import count
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from marl_pack.bins import Bins
 from marl_pack.evaluation.statistics import strict_equilibrium
-from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
 from marl_pack.sapien_check.judge import check
 from marl_pack.sapien_check.processes import in_order
 from marl_pack.sapien_check.stack import DENSITY, Stack
 from marl_pack.sapien_check.world import DEFAULT, Physics
-from marl_pack.stability import OrientedItem, Rule, make_rule
+from marl_pack.stability import make_rule
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from marl_pack.bins import Bins
+    from marl_pack.game.packing import Packing
+    from marl_pack.stability import OrientedItem, Rule
 
 SIZE, CELL, SIDES = (120, 120, 120), 0.005, (6, 60)
 PAPER: dict[str, dict[str, Any]] = {
@@ -87,6 +90,10 @@ def _compile(settings: Settings) -> None:
 
 def _play(settings: Settings, number: int, rule: Timed) -> Iterator[Packing]:
     """Yield the game of bin ``number`` after each of its placements."""
+    import torch
+
+    from marl_pack.game.packing import Packing
+
     draw = np.random.default_rng((settings.seed, 1 + number))
     game = Packing(
         1, SIZE, "rs", sides=SIDES, rule=rule, orientations=(0,), seed=settings.seed,
@@ -100,6 +107,8 @@ def _play(settings: Settings, number: int, rule: Timed) -> Iterator[Packing]:
 
 def fill(settings: Settings, number: int) -> Trial:
     """Play bin ``number`` to its end, judging after every placement."""
+    import torch
+
     torch.set_num_threads(1)
     _compile(settings)
     rule = Timed(make_rule(settings.rule))

@@ -24,7 +24,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from marl_pack.sapien_check.processes import in_order
 from marl_pack.sapien_check.stack import Floats, Stack
@@ -129,6 +128,8 @@ def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
     """
     if not len(stack):
         return
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
     on = stack.scaled(LONGEST / float(stack.sides.max())).rests_on()  # at the scale of check
     distance, angle = np.zeros(len(stack)), np.zeros(len(stack))
     for count in range(1, len(stack) + 1):

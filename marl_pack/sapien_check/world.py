@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marl_pack.installation import missing
+from marl_pack.extras import missing
 from marl_pack.sapien_check.stack import Floats, Stack, overlaps
 
 GROUND_BIT = 31  # of the collision groups: the floor

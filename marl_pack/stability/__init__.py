@@ -8,32 +8,6 @@ parameters. From the strictest to the loosest, ``hull_alpha`` ⊂ ``lbcp`` ⊂ `
 :func:`stable_mask` computes the mask of plain NumPy arrays, without an environment.
 """
 
-from marl_pack.stability.arrays import stable_mask
-from marl_pack.stability.oriented_item import OrientedItem, Rule, orient_item
-from marl_pack.stability.rules import (
-    RULES,
-    area_ratio,
-    equilibrium,
-    hull_1,
-    hull_alpha,
-    lbcp,
-    make_rule,
-    none,
-)
-from marl_pack.stability.static_equilibrium import in_equilibrium
+import lazy_loader
 
-__all__ = [
-    "RULES",
-    "OrientedItem",
-    "Rule",
-    "area_ratio",
-    "equilibrium",
-    "hull_1",
-    "hull_alpha",
-    "in_equilibrium",
-    "lbcp",
-    "make_rule",
-    "none",
-    "orient_item",
-    "stable_mask",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

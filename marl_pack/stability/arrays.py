@@ -13,8 +13,9 @@ from marl_pack.bins import UNKNOWN, Bins
 from marl_pack.checks import real_number, shown
 from marl_pack.geometry import check_size
 from marl_pack.geometry.compiled import place_box
-from marl_pack.stability.oriented_item import NO_OFFSET, OrientedItem, Rule, check_com_offset
-from marl_pack.stability.rules import equilibrium, lbcp, make_rule
+from marl_pack.stability.oriented_item import OrientedItem
+from marl_pack.stability.parameters import NO_OFFSET, check_com_offset
+from marl_pack.stability.rules import Rule, equilibrium, lbcp, make_rule
 from marl_pack.stability.static_equilibrium import check_boxes, uniform_loads, whole_cells
 
 

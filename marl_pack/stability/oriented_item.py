@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
 from torch import Tensor
 
-from marl_pack.bins import Bins
-from marl_pack.checks import real_number, shown
 from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.stability.centres import HALF, CentreTable, Offsets, centre_table, exact
+from marl_pack.stability.parameters import NO_OFFSET
 
 
 @dataclass(frozen=True)
@@ -43,32 +41,6 @@ class OrientedItem:
         if self.weight is not None:
             return self.weight.double()
         return self.sides.double().prod(-1).amax(1)
-
-
-Rule = Callable[[Bins, OrientedItem], Tensor]
-"""``(bins, item) -> bool [N, A, W, D]``: the cells (low corners) where the item fits into the bin
-in each orientation and is stable by the rule. Parameters are bound beforehand
-(:func:`functools.partial`)."""
-
-NO_OFFSET = (0.0, 0.0, 0.0)
-
-
-def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return the offset of the centre of mass as three floats.
-
-    Raises:
-        ValueError: unless there are three numbers, each strictly between -0.5 and 0.5.
-    """
-    try:
-        values = tuple(real_number(f, "com_offset") for f in offset)
-    except TypeError:  # not a sequence
-        values = ()
-    if len(values) != 3 or not all(-0.5 < f < 0.5 for f in values):
-        raise ValueError(
-            f"com_offset {shown(offset)}: needs three fractions of the item's own sides w, d, h, "
-            "each strictly between -0.5 and 0.5 (0 is the geometric centre)"
-        )
-    return values[0], values[1], values[2]
 
 
 def orient_item(

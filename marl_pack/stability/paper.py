@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.installation import missing
+from marl_pack.extras import missing
 from marl_pack.stability.reference import corners
 
 Map = NDArray[np.integer[Any]]

@@ -1,23 +1,49 @@
-"""The stability rules and the table that names them."""
+"""The stability rules and the table that names them.
+
+The code that computes the masks is imported at the first mask, so that names and parameters of the
+rules are known at once.
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from marl_pack.bins import Bins
 from marl_pack.checks import real_number, shown
 from marl_pack.geometry import MAX_SIDE
-from marl_pack.stability import hull_compiled, hull_tensor, reference, support_area
-from marl_pack.stability.equilibrium_masks import equilibrium_mask
-from marl_pack.stability.load_bearing import lbcp_bearing
-from marl_pack.stability.oriented_item import OrientedItem, Rule
+from marl_pack.stability.parameters import Thresholds, check_thresholds
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from marl_pack.backend import Backend
+    from marl_pack.bins import Bins
+    from marl_pack.stability.oriented_item import OrientedItem
+
+Rule = Callable[["Bins", "OrientedItem"], "Tensor"]
+"""``(bins, item) -> bool [N, A, W, D]``: the cells (low corners) where the item fits into the bin
+in each orientation and is stable by the rule. Parameters are bound beforehand
+(:func:`functools.partial`)."""
+
+
+@cache  # an import takes as long as a tenth of a mask
+def _hull_mask(backend: Backend) -> Callable[..., Any]:
+    """Return the code of convex-hull masks."""
+    from marl_pack.stability import hull_compiled, hull_tensor
+
+    return backend.pick(compiled=hull_compiled.support_mask, tensor=hull_tensor.support_mask)
+
+
+@cache
+def _area_mask(backend: Backend) -> Callable[..., Any]:
+    """Return the code of masks by supported area."""
+    from marl_pack.stability import support_area
+
+    return backend.pick(compiled=support_area.mask_compiled, tensor=support_area.mask_tensor)
 
 
 def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float) -> Tensor:
@@ -25,9 +51,11 @@ def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float)
     centres = None
     if item.offsets is not None or margin > 0:
         centres = item.centre_table(margin, max(bins.size[:2]))
-    code = bins.backend.pick(compiled=hull_compiled.support_mask, tensor=hull_tensor.support_mask)
+    code = _hull_mask(bins.backend)
     mask, unsure = code(bins.heightmap, empty_map, item.sides, bins.height, centres)
     for n, a, x, y in [] if unsure is None else unsure.tolist():
+        from marl_pack.stability import reference
+
         w, d, _ = item.sides[n, a].tolist()
         window = np.s_[n, x : x + w, y : y + d]
         heights, bearing = bins.heightmap[window].cpu().numpy(), empty_map[window].cpu() == 0
@@ -49,7 +77,7 @@ def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     Returns:
         Bool [N, A, W, D].
     """
-    return _supported(bins, item, torch.zeros_like(bins.heightmap), margin)
+    return _supported(bins, item, bins.heightmap.new_zeros(bins.heightmap.shape), margin)
 
 
 def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
@@ -67,12 +95,12 @@ def lbcp(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     Gap cells inside a box's support polygon count as well. The polygons are replayed from
     ``bins.boxes``. Arguments as :func:`hull_1`.
     """
+    from marl_pack.stability.load_bearing import lbcp_bearing
+
     return _supported(bins, item, ~lbcp_bearing(bins), margin)
 
 
-def area_ratio(
-    bins: Bins, item: OrientedItem, thresholds: support_area.Thresholds | str = "paper"
-) -> Tensor:
+def area_ratio(bins: Bins, item: OrientedItem, thresholds: Thresholds | str = "paper") -> Tensor:
     """Return the mask of Zhao et al. 2021: supported share of the bottom face, and corners.
 
     Args:
@@ -81,9 +109,9 @@ def area_ratio(
         thresholds: ``"paper"`` (60 % and 4 corners, 80 % and 3, 95 %), ``"code"`` (50 / 85 / 95, as
             the authors' code has it), or pairs (share, corners); shares must be exceeded.
     """
-    pairs = support_area.check_thresholds(thresholds)
-    code = bins.backend.pick(compiled=support_area.mask_compiled, tensor=support_area.mask_tensor)
-    return code(bins.heightmap, item.sides, bins.height, pairs)
+    pairs = check_thresholds(thresholds)
+    mask: Tensor = _area_mask(bins.backend)(bins.heightmap, item.sides, bins.height, pairs)
+    return mask
 
 
 def equilibrium(
@@ -100,6 +128,8 @@ def equilibrium(
         margin: the centre of mass may lie anywhere within so many cells of its place.
         check_stack: whether to check that the stacks stand instead of assuming it.
     """
+    from marl_pack.stability.equilibrium_masks import equilibrium_mask
+
     surely, possibly = hull_alpha(bins, item, margin), hull_1(bins, item, margin)
     return equilibrium_mask(bins, item, surely, possibly, margin, check_stack)
 
@@ -141,5 +171,5 @@ def make_rule(name: str, **parameters: object) -> Rule:
         raise ValueError(f"check_stack {shown(parameters['check_stack'])}: needs true or false")
     if name == "area_ratio":
         thresholds: Any = parameters.get("thresholds", "paper")
-        parameters["thresholds"] = support_area.check_thresholds(thresholds)
+        parameters["thresholds"] = check_thresholds(thresholds)
     return partial(RULES[name], **parameters)

@@ -11,20 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from marl_pack.checks import real_number, shown, whole_number
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
 from marl_pack.installation import njit
 from marl_pack.stability.centres import exact
-
-Thresholds = tuple[tuple[float, int], ...]
-
-PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
-"""(share of the bottom face, corners): more than the share and at least so many corners."""
-CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
-"""The thresholds of the authors' released code."""
-THRESHOLDS = {"paper": PAPER, "code": CODE}
-"""The thresholds by name."""
+from marl_pack.stability.parameters import Thresholds
 
 
 @njit(cache=True, nogil=True)
@@ -144,28 +135,3 @@ def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thres
     for k, (_, corners) in enumerate(thresholds):
         stands |= (area >= fewest[..., k]) & (supported >= corners)
     return possible & stands
-
-
-def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
-    """Return the thresholds given by name (``"paper"``, ``"code"``) or as pairs.
-
-    Raises:
-        ValueError: for an unknown name, a share outside [0, 1] or corners outside 0 … 4.
-    """
-    if isinstance(thresholds, str):
-        if thresholds not in THRESHOLDS:
-            raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {list(THRESHOLDS)}")
-        return THRESHOLDS[thresholds]
-    try:
-        pairs = tuple(
-            (real_number(share, "share"), whole_number(corners, "corners", 0, 4))
-            for share, corners in thresholds
-        )
-    except (TypeError, ValueError):
-        pairs = ()
-    if not pairs or not all(0 <= share <= 1 for share, _ in pairs):
-        raise ValueError(
-            f"area_ratio thresholds {shown(thresholds)}: need pairs (share in [0, 1], whole number"
-            " of corners in 0 … 4)"
-        )
-    return pairs

@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from marl_pack.agents.heuristics import POLICIES, make_policy
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.keys import POLICIES
 from marl_pack.backend import Backend
 from marl_pack.game.invariants import VARIABLE
 from marl_pack.game.packing import Packing

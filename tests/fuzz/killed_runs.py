@@ -41,7 +41,7 @@ ENDED = "after its end"
 # The processes are copies of one that has imported everything, so that most of their time is a
 # run's own: what is imported writes no file.
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["marl_pack.train"])
+CONTEXT.set_forkserver_preload(["marl_pack.train", "marl_pack.training.run"])
 
 
 @dataclass

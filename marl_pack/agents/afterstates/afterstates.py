@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.agents.afterstates import bitboards
+from marl_pack.agents.afterstates.limits import MOST_LENGTHS
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
 from marl_pack.geometry import ORIENTATIONS
@@ -30,8 +31,6 @@ from marl_pack.geometry.tensor import footprint, place_boxes
 from marl_pack.installation import njit
 from marl_pack.stability import hull_compiled, hull_tensor
 
-MOST_LENGTHS = 5
-"""Largest number of different lengths that the sides of the next boxes have."""
 SHARES = 10
 """Heights are distinguished by tenths of the bin's height."""
 STEPS = 6

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from marl_pack.agents.afterstates.afterstates import MOST_LENGTHS, SURFACE, Afterstates
+from marl_pack.agents.afterstates.afterstates import SURFACE, Afterstates
+from marl_pack.agents.afterstates.limits import MOST_LENGTHS
 
 PAIRS = MOST_LENGTHS * (MOST_LENGTHS + 1) // 2
 FEATURES = 2 + PAIRS * MOST_LENGTHS + SURFACE

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
 from marl_pack.agents.afterstates.features import features
+from marl_pack.agents.afterstates.limits import ILLEGAL
 from marl_pack.game.packing import Packing
 
 T = TypeVar("T")
 
-ILLEGAL = -1e6
-"""Value of an illegal placement, less than that of any legal one."""
 AT_ONCE = 1 << 15
 """Largest number of afterstates that the critic values at once."""
 

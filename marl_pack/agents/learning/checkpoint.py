@@ -5,7 +5,7 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
 - ``format``: 2; ``marl_pack``: the version that wrote it;
 - ``config``: the run's resolved settings;
 - ``agents``: a record for each agent. A learned one has its ``network`` (fields of
-  :class:`marl_pack.agents.networks.trunk.Network`) and weights as rsl_rl's ``PPO.save()`` gives
+  :class:`marl_pack.agents.networks.shape.Network`) and weights as rsl_rl's ``PPO.save()`` gives
   them (``actor_state_dict``, ``critic_state_dict``, ``optimizer_state_dict``), and the record of
   its ``teacher`` while it clones one. A frozen one has its network and the actor's weights, with
   an ``afterstate_critic`` of its own if it sees values, or the ``name`` of the heuristic that plays
@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from marl_pack import published
-from marl_pack.agents.heuristics import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learning import migration
 from marl_pack.agents.learning.form import (
     Plain,
@@ -41,7 +41,7 @@ from marl_pack.agents.learning.form import (
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, ORIENTATION, PLACEMENT
 from marl_pack.agents.networks.planes import need_critic
-from marl_pack.agents.networks.trunk import Network
+from marl_pack.agents.networks.shape import Network
 from marl_pack.checks import described, shown, whole_number
 from marl_pack.files import write_atomically
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from rsl_rl.utils.logger import Logger
 
-from marl_pack.installation import missing
+from marl_pack.extras import missing
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from marl_pack.agents.learning.logging import IterationLogger, Progress
 from marl_pack.agents.learning.ppo import PackingPPO
 from marl_pack.agents.learning.resuming import check_generator, check_progress, checked_optimizer
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice
-from marl_pack.agents.networks.trunk import Network, widen
+from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.trunk import widen
 from marl_pack.agents.policy import Placement, Policy
 from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv

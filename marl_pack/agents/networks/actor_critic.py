@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from marl_pack.agents.networks.distribution import MaskedCategorical
 from marl_pack.agents.networks.heads import pooled_head
 from marl_pack.agents.networks.kinds import AGENT_KINDS
-from marl_pack.agents.networks.planes import Observation
-from marl_pack.agents.networks.trunk import Features, Network, Trunk
+from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.sight import Observation
+from marl_pack.agents.networks.trunk import Features, Trunk
 
 
 class Actor(MLPModel):
@@ -23,7 +24,7 @@ class Actor(MLPModel):
         obs: an observation of G games, any mapping of tensors.
         obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
-        network: fields of :class:`marl_pack.agents.networks.trunk.Network`.
+        network: fields of :class:`marl_pack.agents.networks.shape.Network`.
     """
 
     def __init__(

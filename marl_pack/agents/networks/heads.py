@@ -5,7 +5,8 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from marl_pack.agents.layers import initialized
-from marl_pack.agents.networks.trunk import Features, Network, count_features
+from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.trunk import Features, count_features
 
 
 class Pool(nn.Module):

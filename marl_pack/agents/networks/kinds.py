@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.networks.heads import ScoreMap, pooled_head
-from marl_pack.agents.networks.planes import PLANES, Sight
-from marl_pack.agents.networks.trunk import Network
+from marl_pack.agents.networks.planes import PLANES
+from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.sight import Sight
 from marl_pack.game.moves import Floor
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS

@@ -7,72 +7,23 @@ the exported files, and networks that get more planes.
 The shape of a tensor in an observation says what it describes. In [G, W, D] each cell describes a
 column of the bin; in [G, A, W, D] each cell describes a placement with its low corner there, in one
 of the A orientations that the agent judges; [G, 1] is one number for the bin.
+
+The names of the planes are part of the settings, so torch is imported only where it is used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+from marl_pack.agents.afterstates.limits import ILLEGAL
 
-from marl_pack.agents.afterstates.lookahead import ILLEGAL, Lookahead
-from marl_pack.bins import utilization
-from marl_pack.game.moves import Moves
-from marl_pack.game.packing import Packing
-from marl_pack.geometry import resting_heights_and_waste
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-Observation = Mapping[str, Tensor]
-"""The tensors that an agent observes, by name."""
-
-
-@dataclass(frozen=True)
-class Sight:
-    """One agent's view of a turn of G games.
-
-    Args:
-        game: the games.
-        lookahead: what placements leave, and its value.
-        planes: names of the planes to make.
-        orientation: int64 [G], once the orientations are chosen; None before.
-    """
-
-    game: Packing
-    lookahead: Lookahead
-    planes: Sequence[str]
-    orientation: Tensor | None = None
-
-    @cached_property
-    def item(self) -> Tensor:
-        """Sides of the item int16 [G, 3]: its own, or along x, y, z in the chosen orientation."""
-        if self.orientation is None:
-            return self.game.items.sides
-        return self.game.orient(self.orientation, check=False).sides
-
-    def judged(self, values: Tensor) -> Tensor:
-        """Select the values [G, 6, …] of the A orientations that the agent judges, [G, A, …]."""
-        if self.orientation is None:
-            return values
-        return Moves.gather(values, self.orientation)[:, None]
-
-    @cached_property
-    def mask(self) -> Tensor:
-        """The cells where the item may be placed in the judged orientations, bool [G, A, W, D]."""
-        return self.judged(self.game.mask)
-
-    @cached_property
-    def windows(self) -> tuple[Tensor, Tensor]:
-        """Resting heights int16 and wasted cells int32 [G, A, W, D] (no entries if not needed)."""
-        if self.orientation is None:
-            sides = self.game.orient_item(self.game.items).sides
-        else:
-            sides = self.item[:, None]
-        bins = self.game.bins
-        return resting_heights_and_waste(
-            bins.heightmap, sides, bins.height, waste="waste" in self.planes, backend=bins.backend
-        )
+    from marl_pack.agents.networks.sight import Observation, Sight
 
 
 @dataclass(frozen=True)
@@ -129,6 +80,8 @@ def _encode_feasible_cells(observation: Observation) -> list[Tensor]:
 
 
 def _observe_afterstate_value(sight: Sight) -> dict[str, Tensor]:
+    import torch
+
     value = sight.judged(sight.lookahead.afterstate_value(sight.game))
     best = value.flatten(1).amax(1, keepdim=True)
     best = torch.where(best > ILLEGAL, best, 0)
@@ -205,7 +158,7 @@ PLANES: dict[str, Plane] = {
         Plane(
             "filled",
             "the filled share of the bin; if items are cut from the bin, the rest is to come",
-            lambda sight: {"filled": utilization(sight.game.bins)[:, None].float()},
+            lambda sight: {"filled": sight.utilization[:, None].float()},
             lambda orientations: 1,
             lambda observation: [_everywhere(observation["filled"], _shape(observation))],
         ),
@@ -236,6 +189,8 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
     Returns:
         Float32 [G, C, W, D], channels last in memory.
     """
+    import torch
+
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]
     height = observation["height"].float()  # [G, 1]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind
-from marl_pack.agents.networks.planes import Observation
+from marl_pack.agents.networks.sight import Observation
 from marl_pack.game.moves import Floor
 from marl_pack.geometry import oriented
 

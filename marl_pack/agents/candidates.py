@@ -1,0 +1,61 @@
+"""What heuristics know of every placement of the visible items."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.game.packing import Packing
+from marl_pack.geometry import resting_heights_and_waste
+
+
+class Candidates:
+    """Every placement of each visible item, legal or not; tensors broadcast to [G, 6, W, D].
+
+    Args:
+        game: the games.
+        lookahead: what placements leave.
+    """
+
+    def __init__(self, game: Packing, lookahead: Lookahead) -> None:
+        self.game, self.lookahead = game, lookahead
+        self.size = game.size
+        self.sides = game.orient_item(game.items).sides  # int16 [G, 6, 3]
+        self.x = torch.arange(game.size[0], device=game.device)[:, None]  # int64 [W, 1]
+        self.y = torch.arange(game.size[1], device=game.device)[None, :]  # int64 [1, D]
+
+    def _windows(self, waste: bool) -> tuple[Tensor, Tensor]:
+        bins = self.game.bins
+        return resting_heights_and_waste(
+            bins.heightmap, self.sides, bins.height, waste=waste, backend=bins.backend
+        )
+
+    @cached_property
+    def _both(self) -> tuple[Tensor, Tensor]:
+        """Resting heights and wasted cells of every placement, computed together."""
+        return self._windows(waste=True)
+
+    @cached_property
+    def z(self) -> Tensor:
+        """Resting heights, int64 [G, 6, W, D]."""
+        if "_both" in vars(self):
+            return self._both[0].long()
+        return self._windows(waste=False)[0].long()
+
+    @cached_property
+    def waste(self) -> Tensor:
+        """Empty cells that would be enclosed below the item, int64 [G, 6, W, D]."""
+        return self._both[1].long()
+
+    @cached_property
+    def top(self) -> Tensor:
+        """Heights of the item's top, at most H, int64 [G, 6, W, D]."""
+        return (self.z + self.sides[..., 2, None, None]).clamp(max=self.size[2])
+
+    @cached_property
+    def feasible_cells(self) -> Tensor:
+        """Mean number of cells left for a box that may come, float32 [G, 6, W, D]."""
+        return self.lookahead.feasible_cells(self.game)

@@ -1,0 +1,65 @@
+"""The keys by which heuristics rank placements, and the names of all players that need no file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from marl_pack.agents.afterstates.limits import MOST_LENGTHS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from marl_pack.agents.candidates import Candidates
+
+Keys = Sequence[tuple["Tensor", int]]
+"""Whole numbers broadcastable to [G, 6, W, D], each with a bound that is larger; the first key
+decides, the next ones break ties."""
+
+
+def dblf(c: Candidates) -> Keys:
+    """Deepest, bottom, left (Karabulut & İnceoğlu 2004): lowest z, then x, then y."""
+    return (c.z, c.size[2] + 1), (c.x, c.size[0]), (c.y, c.size[1])
+
+
+def height_min(c: Candidates) -> Keys:
+    """Heightmap minimisation (Wang & Hauser 2021): least c · (x + y) + sum of the new heightmap.
+
+    With a small c, as in the paper, the sum decides and x + y breaks ties. As the item's volume is
+    the same everywhere, the sum is least where least space is enclosed.
+    """
+    width, depth, height = c.size
+    return (c.waste, width * depth * height), (c.x + c.y, width + depth)
+
+
+def best_fit(c: Candidates) -> Keys:
+    """Best fit by wasted space: fewest empty cells enclosed, then the lowest top, then x + y."""
+    width, depth, height = c.size
+    return (c.waste, width * depth * height), (c.top, height + 1), (c.x + c.y, width + depth)
+
+
+def max_feasible(c: Candidates) -> Keys:
+    """Most feasible cells afterwards (:meth:`Lookahead.feasible_cells`), then top, then x + y.
+
+    Greatest mean number of cells where a box that may come next could be placed, then the lowest
+    top, then the lowest x + y.
+    """
+    width, depth, height = c.size
+    most = width * depth * MOST_LENGTHS**3
+    cells = (c.feasible_cells.double() * MOST_LENGTHS**3).round().long()
+    return (most - cells, most + 1), (c.top, height + 1), (c.x + c.y, width + depth)
+
+
+KEYS: dict[str, Callable[[Candidates], Keys]] = {
+    "dblf": dblf,
+    "height_min": height_min,
+    "best_fit": best_fit,
+    "max_feasible": max_feasible,
+}
+"""The keys of every heuristic, by its name."""
+
+POLICIES = (*KEYS, "random")
+"""Names of :func:`marl_pack.agents.heuristics.make_policy`, and of ``make_placement_agent``."""
+
+ORIENTATION_AGENTS = (*POLICIES, "first")
+"""Names of :func:`marl_pack.agents.heuristics.make_orientation_agent`."""

@@ -1,0 +1,62 @@
+"""The shape of a network, as settings and checkpoints give it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from marl_pack import renamed
+from marl_pack.agents.networks.planes import PLANES
+from marl_pack.checks import shown, truth_value, whole_number
+from marl_pack.geometry import MAX_SIDE
+
+MOST = {"channels": 4096, "layers": 128, "dilation": MAX_SIDE, "hidden": 65536}
+"""The largest value of each size of a network."""
+
+
+@dataclass
+class Network:
+    """The shape of an agent's network.
+
+    Args:
+        channels: feature channels of the convolutional trunk.
+        layers: number of its 3 × 3 convolutions.
+        residual: whether each convolution after the first adds to its input.
+        dilation: cells between the taps of each convolution after the first; with 2, three layers
+            reach 5 cells far in place of 3.
+        shortcut: whether the heads see the input channels themselves beside the features.
+        context: whether features pooled over the whole bin are added to every cell's.
+        planes: input planes beside the paper's four channels: any of {planes}.
+        hidden: units of the hidden layer in the heads that follow pooling.
+        share_trunk: whether the critic sees the actor's features or has a trunk of its own.
+    """
+
+    channels: int = 32
+    layers: int = 3
+    residual: bool = True
+    dilation: int = 1
+    shortcut: bool = False
+    context: bool = False
+    planes: list[str] = field(default_factory=lambda: ["mask", "resting_height", "waste"])
+    hidden: int = 64
+    share_trunk: bool = True
+
+    def __post_init__(self) -> None:
+        for name, most in MOST.items():
+            value = getattr(self, name)
+            whole_number(value, f"network: {name} = {shown(value)}", 1, most)
+        for name in ("residual", "shortcut", "context", "share_trunk"):
+            truth_value(getattr(self, name), f"network: {name}")
+        if not isinstance(self.planes, list | tuple) or not all(
+            isinstance(plane, str) for plane in self.planes
+        ):
+            raise ValueError(f"network: planes = {shown(self.planes)}: needs a list of names")
+        for plane in self.planes:
+            renamed.refuse_old(plane, renamed.PLANES, "network: plane")
+        unknown = [plane for plane in self.planes if plane not in PLANES]
+        if unknown or len(set(self.planes)) < len(self.planes):
+            raise ValueError(
+                f"network: planes {shown(self.planes)}: any of {', '.join(PLANES)}, once"
+            )
+
+
+Network.__doc__ = (Network.__doc__ or "").replace("{planes}", ", ".join(PLANES))

@@ -1,0 +1,195 @@
+"""Make the players and the game that a command's options name.
+
+An option of the game that is not given comes from the first checkpoint among the players. Without
+one the game is RS in a bin of 10 × 10 × 10 under ``hull_alpha``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.bins import check_device
+from marl_pack.checks import LARGEST_SEED, whole_number
+from marl_pack.game.packing import Packing
+from marl_pack.game.spec import GameSpec, given_options
+from marl_pack.geometry import Size
+from marl_pack.items import (
+    DEFAULT_SIDES,
+    GENERATED,
+    Stream,
+    choose_stream,
+    independent,
+    make_stream,
+)
+from marl_pack.options import MOST_AT_ONCE
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The players and the game that a command's options name."""
+
+    policies: dict[str, Policy]  # by the name of each one's row
+    stream: Stream
+    items: str  # a generated stream's name, or a file
+    sides: tuple[int, int]  # of generated items
+    spec: GameSpec
+    arguments: argparse.Namespace  # the options as they were given
+
+    def game(self, n: int, first_episode: int) -> Packing:
+        """Return ``n`` games without ``auto_reset``, from the episode ``first_episode`` on."""
+        return Packing(
+            n, items=self.stream, spec=self.spec, device=self.arguments.device,
+            seed=self.arguments.seed, first_episode=first_episode, auto_reset=False,
+        )  # fmt: skip
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All options, those of the game filled in, for a report."""
+        paths = "json", "save_stacks"
+        options = {key: value for key, value in vars(self.arguments).items() if key not in paths}
+        return options | self.spec.to_dict() | {"items": self.items, "sides": self.sides}
+
+    def __str__(self) -> str:
+        text = self.items
+        if self.items in GENERATED and self.sides != DEFAULT_SIDES:
+            text += f" {self.sides[0]}-{self.sides[1]}"
+        text += f", {self.spec}"
+        if self.arguments.symmetric:
+            text += "; learned agents asked in all symmetries"
+        return text
+
+
+def set_threads(threads: int) -> None:
+    """Set the number of threads on the CPU.
+
+    Raises:
+        ValueError: unless it is a whole number that a computer can run.
+    """
+    torch.set_num_threads(whole_number(threads, "--threads", 1, MOST_AT_ONCE))
+
+
+def choose(arguments: argparse.Namespace, console: Console) -> Setup:
+    """Return the players and the game that the options name.
+
+    Args:
+        arguments: the options.
+        console: shows the game that each checkpoint was trained on.
+
+    Raises:
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
+    """
+    check_device(arguments.device)
+    whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
+    policies, learned = choose_policies(arguments, console)
+    stream, items, sides, spec = choose_game(arguments, learned)
+    if arguments.plan is not None:
+        policies = with_search(policies, arguments, stream, spec.bin)
+    return Setup(policies, stream, items, sides, spec, arguments)
+
+
+def choose_game(
+    arguments: argparse.Namespace, learned: dict[str, Any]
+) -> tuple[Stream, str, tuple[int, int], GameSpec]:
+    """Return the item stream, its name, the sides of generated items, and the game.
+
+    Args:
+        arguments: the options; None where one was not given.
+        learned: the game that the policies were trained on, empty if there is none.
+    """
+    chosen = given_options(arguments)
+    if "rule" in chosen:  # these belong to the rule
+        learned = learned | {"margin": None, "thresholds": None}
+    items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
+    low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
+    size = chosen.get("bin")
+    if size is None and (arguments.items is None or items in GENERATED):
+        size = learned.get("bin")
+    stream, bin_size = choose_stream(items, tuple(size) if size else None, (low, high))
+    spec = GameSpec.of(learned | chosen | {"bin": bin_size})
+    return stream, items, (low, high), spec
+
+
+def choose_policies(
+    arguments: argparse.Namespace, console: Console
+) -> tuple[dict[str, Policy], dict[str, Any]]:
+    """Return the policies that the options name, by the name of their row, and their game.
+
+    The game is that of the first checkpoint among them (the keys of
+    :class:`marl_pack.config.Game`), empty if there is none.
+
+    Raises:
+        ValueError, FileNotFoundError: if there is no policy of such a name.
+    """
+    pair = arguments.orientation, arguments.placement
+    if (pair[0] is None) != (pair[1] is None):
+        raise ValueError("--orientation and --placement go together: name both agents")
+    names = arguments.policy or ([] if pair[0] else ["dblf"])
+    sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
+    if arguments.symmetric and all(name in ORIENTATION_AGENTS for name in sources):
+        raise ValueError("--symmetric: needs a run's folder or checkpoint")
+    # Learned agents need rsl_rl, which is slow to import.
+    from marl_pack.agents.learning import checkpoint as checkpoints
+    from marl_pack.agents.loading import Loader, trained_game, trained_on
+
+    settings = arguments.device, arguments.seed, arguments.symmetric
+    policies = {name: Loader(*settings).policy(name) for name in names}
+    if pair[0] is not None:
+        loader = Loader(*settings)
+        policies[f"{pair[0]} + {pair[1]}"] = in_turns(
+            loader.orientation_agent(pair[0]), loader.placement_agent(pair[1])
+        )
+    learned: dict[str, Any] = {}
+    for source in sources:
+        if source not in ORIENTATION_AGENTS:
+            checkpoint = checkpoints.read(source)
+            try:
+                learned = learned or trained_game(checkpoint)
+                description = trained_on(checkpoint)
+            except ValueError as error:
+                raise ValueError(f"{source}: {error}") from None
+            console.print(f"{source}: trained on {description}", soft_wrap=True)
+    return policies, learned
+
+
+def with_search(
+    policies: dict[str, Policy], arguments: argparse.Namespace, stream: Stream, size: Size
+) -> dict[str, Policy]:
+    """Return the policies, the learned ones with the search of ``--plan``; heuristics unchanged.
+
+    They imagine items of the stream that they were trained on; if that was a file, rows of
+    ``stream``.
+
+    Raises:
+        ValueError: if the settings cannot be read, or there is no checkpoint to search with.
+    """
+    from marl_pack.agents.learning import checkpoint as checkpoints
+    from marl_pack.agents.loading import Loader, trained_game
+    from marl_pack.agents.search import SearchSettings
+
+    settings = SearchSettings.parse(arguments.plan)
+    if all(name in POLICIES for name in policies) or arguments.orientation is not None:
+        raise ValueError("--plan: needs --policy with a run's folder or checkpoint")
+    policies_with_search: dict[str, Policy] = {}
+    for name, policy in policies.items():
+        if name in POLICIES:
+            policies_with_search[name] = policy
+            continue
+        checkpoint = checkpoints.read(name, arguments.device)
+        game = trained_game(checkpoint)
+        learned = stream
+        if game["items"] in GENERATED:
+            try:
+                learned = make_stream(game["items"], size, tuple(game["sides"]))
+            except ValueError as error:
+                raise ValueError(f"--plan: items of the agents' training: {error}") from None
+        futures = independent(learned).to(arguments.device)
+        loader = Loader(arguments.device, arguments.seed, arguments.symmetric)
+        policies_with_search[f"{name}, {settings}"] = loader.planner(checkpoint, settings, futures)
+    return policies_with_search

@@ -1,0 +1,59 @@
+"""Parameters of rules and of items: thresholds of support areas and centres of mass."""
+
+from __future__ import annotations
+
+from marl_pack.checks import real_number, shown, whole_number
+
+Thresholds = tuple[tuple[float, int], ...]
+
+PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
+"""(share of the bottom face, corners): more than the share and at least so many corners."""
+CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
+"""The thresholds of the authors' released code."""
+THRESHOLDS = {"paper": PAPER, "code": CODE}
+"""The thresholds by name."""
+
+NO_OFFSET = (0.0, 0.0, 0.0)
+
+
+def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return the offset of the centre of mass as three floats.
+
+    Raises:
+        ValueError: unless there are three numbers, each strictly between -0.5 and 0.5.
+    """
+    try:
+        values = tuple(real_number(f, "com_offset") for f in offset)
+    except TypeError:  # not a sequence
+        values = ()
+    if len(values) != 3 or not all(-0.5 < f < 0.5 for f in values):
+        raise ValueError(
+            f"com_offset {shown(offset)}: needs three fractions of the item's own sides w, d, h, "
+            "each strictly between -0.5 and 0.5 (0 is the geometric centre)"
+        )
+    return values[0], values[1], values[2]
+
+
+def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
+    """Return the thresholds given by name (``"paper"``, ``"code"``) or as pairs.
+
+    Raises:
+        ValueError: for an unknown name, a share outside [0, 1] or corners outside 0 … 4.
+    """
+    if isinstance(thresholds, str):
+        if thresholds not in THRESHOLDS:
+            raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {list(THRESHOLDS)}")
+        return THRESHOLDS[thresholds]
+    try:
+        pairs = tuple(
+            (real_number(share, "share"), whole_number(corners, "corners", 0, 4))
+            for share, corners in thresholds
+        )
+    except (TypeError, ValueError):
+        pairs = ()
+    if not pairs or not all(0 <= share <= 1 for share, _ in pairs):
+        raise ValueError(
+            f"area_ratio thresholds {shown(thresholds)}: need pairs (share in [0, 1], whole number"
+            " of corners in 0 … 4)"
+        )
+    return pairs
