@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark clean
+.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -52,12 +52,15 @@ train: $(STAMP)  ## train for a few minutes, then compare with heuristics
 	fi
 	$(BIN)/python -m marl_pack.evaluate --policy runs/quick dblf random --items rs --seed 1
 
-benchmark: $(STAMP)  ## every figure of docs/results.md on speed
+benchmark: $(STAMP)  ## measure every figure of docs/results.md on speed
 	$(BIN)/python -m benchmarks.masks
 	$(BIN)/python -m benchmarks.rules
 	$(BIN)/python -m benchmarks.room
 	$(BIN)/python -m benchmarks.game
 	$(BIN)/python -m benchmarks.training
+
+results: $(STAMP)  ## make docs/results.md of the figures in results/
+	$(BIN)/python -m experiments.page
 
 clean:  ## forget compiled code and caches
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -11,19 +11,11 @@ import time
 import numpy as np
 import torch
 
-from benchmarks.timing import devices, show
+from benchmarks.record import Measurements
+from benchmarks.timing import devices
 from marl_pack import env_aec
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.game.packing import Packing
-
-OTHERS = (
-    ("Zhao 2021 (1 orientation)", 1413),
-    ("PCT, setting 1 (2 orientations)", 375),
-    ("GOPT (2 orientations)", 318),
-    ("LBCP's environment", 63),
-)
-"""Steps per CPU-second of other environments, each in its own code: one process, random feasible
-play, 64 types, the feasibility mask at every step; measured side by side on one 2-core machine."""
 
 
 def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> float:
@@ -46,31 +38,25 @@ def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> f
     return best
 
 
-def batched() -> None:
-    """Print steps per second against the number of games."""
-    rows = []
+def batched(measured: Measurements) -> None:
+    """Keep steps per second against the number of games."""
     for device in devices():
         for n in (1, 64, 1024, 4096) if device == "cpu" else (1024, 4096, 16384, 65536):
             speed = steps_per_second(Packing(n, device=device))
-            rows.append([f"marl_pack, N = {n:,}", device, f"{speed:,.0f}"])
-    rows += [[name, "cpu, reported", f"{speed:,}"] for name, speed in OTHERS]
-    show("steps a second, 10 × 10 × 10, 6 orientations", ["", "device", "steps/s"], rows)
+            measured.keep(f"N = {n:,}, {device}", steps_per_second=speed)
 
 
-def scaling() -> None:
-    """Print steps per second against the grid's size; the items grow with the bin."""
-    rows = []
+def scaling(measured: Measurements) -> None:
+    """Keep steps per second against the grid's size; the items grow with the bin."""
     for side in (10, 20, 40, 80, 160):
         n = max(4, 1024 * 100 // side**2)
         game = Packing(n, (side, side, side), sides=(side // 5, side // 2))
         each = 1 / steps_per_second(game, 0.5, 3)
-        rows.append([f"{side}³", f"{n}", f"{1e6 * each:,.2f}", f"{1e9 * each / side**2:.1f}"])
-    columns = ["bin", "N", "µs a step", "ns a step and cell"]
-    show("the game against the grid", columns, rows)
+        measured.keep(f"grid: {side}³", n=n, us_step=1e6 * each, ns_step_cell=1e9 * each / side**2)
 
 
-def through_pettingzoo(seconds: float = 1.0, repeats: int = 5) -> None:
-    """Print turns per CPU-second of one game through the AEC view, in all its wrappers."""
+def through_pettingzoo(measured: Measurements, seconds: float = 1.0, repeats: int = 5) -> None:
+    """Keep turns per CPU-second of one game through the AEC view, in all its wrappers."""
     env = env_aec.env()
     env.reset(seed=0)
     generator = np.random.default_rng(0)
@@ -89,15 +75,17 @@ def through_pettingzoo(seconds: float = 1.0, repeats: int = 5) -> None:
                 del agent
             env.reset()
         best = max(best, turns / (time.process_time() - start))
-    show("one bin, PettingZoo AEC", ["", "turns/s"], [["env()", f"{best:,.0f}"]])
+    measured.keep("PettingZoo, one bin", turns_per_second=best)
 
 
 def main() -> None:
-    """Print all figures of this benchmark."""
+    """Measure all figures of this benchmark."""
+    measured = Measurements("game", __doc__, seed=0)
+    measured.parse()
     torch.set_num_threads(1)
-    batched()
-    scaling()
-    through_pettingzoo()
+    batched(measured)
+    scaling(measured)
+    through_pettingzoo(measured)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from benchmarks.record import Measurements
 from benchmarks.states import LARGE, SMALL, in_play, random_items
-from benchmarks.timing import best_time, devices, show
+from benchmarks.timing import best_time, devices
 from marl_pack.stability import (
     RULES,
     OrientedItem,
@@ -25,8 +26,8 @@ from marl_pack.stability import (
 from marl_pack.stability.paper import convex_hull_alpha
 
 
-def against_the_literal_reading(states: int = 32) -> None:
-    """Print figure 1: one mask, compared with the literal reading."""
+def against_the_literal_reading(measured: Measurements, states: int = 32) -> None:
+    """Keep figure 1: one mask, compared with the literal reading."""
     size, sides = LARGE
     game = in_play(states, LARGE, steps=12)
     items = random_items(states, sides)
@@ -50,25 +51,19 @@ def against_the_literal_reading(states: int = 32) -> None:
         seconds["levels"] += best_time(lambda a=flat: hull_compiled.fill_levels(*a))  # type: ignore[misc]  # bound now
     mean = {name: value / states for name, value in seconds.items()}
     mean["alone"] = mean["kernel"] - mean["levels"]
-    rows = [
-        [what, f"{1e6 * mean[name]:,.1f}", f"{mean['literal'] / mean[name]:,.0f}"]
-        for what, name in (
-            ("literal Algorithm 1 with OpenCV", "literal"),
-            ("hull_alpha, prepared once a placement", "alone"),
-            ("hull_alpha, preparation included", "kernel"),
-            ("hull_alpha, preparation and Python call included", "mask"),
+    for what, name in (
+        ("literal Algorithm 1 with OpenCV", "literal"),
+        ("hull_alpha, prepared once a placement", "alone"),
+        ("hull_alpha, preparation included", "kernel"),
+        ("hull_alpha, preparation and Python call included", "mask"),
+    ):
+        measured.keep(
+            f"one mask: {what}", us=1e6 * mean[name], times_faster=mean["literal"] / mean[name]
         )
-    ]
-    show(
-        f"one mask, bin {size[0]} × {size[1]}, sides {sides[0]}–{sides[1]}, {states} states",
-        ["", "µs a mask", "times faster"],
-        rows,
-    )
 
 
-def batched(n: int = 1024) -> None:
-    """Print figure 2: the batched masks of every rule."""
-    rows = []
+def batched(measured: Measurements, n: int = 1024) -> None:
+    """Keep figure 2: the batched masks of every rule."""
     for device in devices():
         game = in_play(n, SMALL, device=device)
         item = game.orient_item(game.items)
@@ -79,16 +74,14 @@ def batched(n: int = 1024) -> None:
                 5,
                 device,
             )
-            rows.append([name, device, f"{6 * n / seconds / 1e6:,.3f}"])
-    show(f"{n:,} bins × 6 orientations, 10 × 10 × 10", ["rule", "device", "million masks/s"], rows)
+            measured.keep(f"batched: {name}, {device}", masks_per_second=6 * n / seconds)
 
 
-def scaling() -> None:
-    """Print figure 3: the cost of masks against the grid.
+def scaling(measured: Measurements) -> None:
+    """Keep figure 3: the cost of masks against the grid.
 
     The items grow with the bin, from its 5th to half of it.
     """
-    rows = []
     for side in (10, 20, 40, 80, 160):
         place = ((side, side, side), (side // 5, side // 2))
         n = max(8, 4096 * 100 // side**2)
@@ -96,16 +89,17 @@ def scaling() -> None:
         item = orient_item(game.items.sides)
         seconds = best_time(lambda g=game, i=item: hull_alpha(g.bins, i), 5)  # type: ignore[misc]  # bound now
         each = seconds / (6 * n)
-        rows.append([f"{side} × {side}", f"{1e6 * each:.3f}", f"{1e9 * each / side**2:.2f}"])
-    show("hull_alpha against the grid", ["grid", "µs a mask", "ns a cell"], rows)
+        measured.keep(f"grid: {side} × {side}", us=1e6 * each, ns_cell=1e9 * each / side**2)
 
 
 def main() -> None:
-    """Print all three figures of this benchmark."""
+    """Measure all three figures of this benchmark."""
+    measured = Measurements("masks", __doc__, seed=1)
+    measured.parse()
     torch.set_num_threads(1)
-    against_the_literal_reading()
-    batched()
-    scaling()
+    against_the_literal_reading(measured)
+    batched(measured)
+    scaling(measured)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ parts, by several processes and on several machines.
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import os
@@ -25,7 +26,7 @@ from marl_pack.files import write_json
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
 PACKAGES = ("torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless")
-MEASURED = ("marl_pack", "models", "configs")
+MEASURED = ("marl_pack", "models/*.pt", "configs")
 """What figures depend on, beside the commands themselves."""
 PROGRAMS = {
     "packing": "experiments.packing --tables packing",
@@ -88,6 +89,38 @@ class Results:
     def _locked(self) -> FileLock:
         self.folder.mkdir(exist_ok=True)
         return FileLock(self.folder / f".{self.name}.lock")
+
+
+class Measurements:
+    """What one program of ``benchmarks/`` measures: each row is printed and kept.
+
+    Args:
+        name: of the program and of its table.
+        description: the program's docstring.
+        seed: of all that is random in it.
+    """
+
+    def __init__(self, name: str, description: str, seed: int) -> None:
+        self.options = argparse.ArgumentParser(
+            prog=f"python -m benchmarks.{name}", description=description,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
+        self.options.add_argument("--results", type=Path, default=RESULTS, metavar="FOLDER",
+                                  help="of the table (default: results)")  # fmt: skip
+        self.name, self.seed = name, seed
+
+    def parse(self) -> argparse.Namespace:
+        """Read the command line."""
+        chosen = self.options.parse_args()
+        self.results = Results(self.name, chosen.results)
+        self.record = record(f"python -m benchmarks.{self.name}", [self.seed])
+        return chosen
+
+    def keep(self, key: str, **figures: float) -> None:
+        """Print and keep the figures of one row."""
+        print(f"{key}: " + ", ".join(f"{name} {value:,.6g}" for name, value in figures.items()),
+              flush=True)  # fmt: skip
+        self.results.put(key, figures, self.record)
 
 
 def made_by(table: str) -> str:

@@ -13,7 +13,8 @@ from functools import partial
 
 import torch
 
-from benchmarks.timing import best_time, devices, show
+from benchmarks.record import Measurements
+from benchmarks.timing import best_time, devices
 from marl_pack.agents.afterstates.afterstates import (
     Afterstates,
     afterstates_by_compiled_loops,
@@ -39,9 +40,10 @@ def seconds(
 
 
 def main() -> None:
-    """Time the afterstates and print the table."""
+    """Time the afterstates of two bins."""
+    measured = Measurements("room", __doc__, seed=1)
+    measured.parse()
     torch.set_num_threads(1)
-    rows = []
     for n, size, sides in ((64, (10, 10, 10), (2, 5)), (8, (20, 20, 20), (4, 10))):
         game = Packing(n, size, sides=sides, seed=1)
         policy = make_policy("random", seed=1)
@@ -58,16 +60,12 @@ def main() -> None:
             time = seconds(afterstates_of, game, Backend.TENSOR, device)
             timings.append(("tensor code", device, time))
         for name, device, time in timings:
-            rows.append(
-                [f"{size[0]}³, sides {sides[0]}-{sides[1]}", name, device,
-                 f"{1e6 * time / placements:,.2f}", f"{1e6 * time / n:,.0f}",
-                 f"{masks / time:.2g}"]
-            )  # fmt: skip
-    show(
-        "afterstates of legal placements",
-        ["bin", "by", "device", "µs a placement", "µs an item", "times compiled masks"],
-        rows,
-    )
+            measured.keep(
+                f"{size[0]}³, sides {sides[0]}–{sides[1]}: {name}, {device}",
+                us_placement=1e6 * time / placements,
+                us_item=1e6 * time / n,
+                times_compiled_masks=masks / time,
+            )
 
 
 if __name__ == "__main__":

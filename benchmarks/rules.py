@@ -7,22 +7,26 @@ excludes. Linear programs a decision: the cells that ``hull_1`` allows and ``hul
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import torch
 
+from benchmarks.record import Measurements
 from benchmarks.states import LARGE, SMALL
-from benchmarks.timing import show
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.game.packing import Packing
 from marl_pack.stability import RULES, make_rule
 
 
 def compare(
-    title: str, place: tuple[tuple[int, int, int], tuple[int, int]], policy: str, n: int, steps: int
+    measured: Measurements,
+    title: str,
+    place: tuple[tuple[int, int, int], tuple[int, int]],
+    policy: str,
+    n: int,
+    steps: int,
 ) -> None:
-    """Print the table of one setting: ``n`` bins, ``steps`` decisions in each."""
+    """Keep the figures of one setting: ``n`` bins, ``steps`` decisions in each."""
     size, sides = place
     game, player = Packing(n, size, sides=sides, seed=1), make_policy(policy, 1)
     rules = {name: make_rule(name) for name in RULES}
@@ -30,6 +34,8 @@ def compare(
     unsound = dict.fromkeys(RULES, 0)
     seconds = dict.fromkeys(RULES, 0.0)
     programs = between = 0
+    for rule in rules.values():  # compiled code is loaded at its first use
+        rule(game.bins, game.orient_item(game.items))
     for _ in range(steps):
         item = game.orient_item(game.items)
         masks = {}
@@ -44,36 +50,33 @@ def compare(
         between += int((masks["hull_1"] & ~masks["lbcp"]).sum())
         game.place(*player(game))
     decisions = n * steps
-    rows = [
-        [
-            name,
-            f"{cells[name] / cells['equilibrium']:.4f}",
-            f"{cells[name] / cells['hull_1']:.4f}",
-            f"{unsound[name] / max(cells[name], 1):.4f}",
-            f"{1e6 * seconds[name] / decisions:,.1f}",
-        ]
-        for name in RULES
-    ]
-    show(
-        f"{title}, {decisions:,} decisions",
-        ["rule", "of equilibrium", "of hull_1", "unsound", "µs a decision"],
-        rows,
-    )
-    print(
-        f"linear programs a decision: {programs / decisions:.2f} "
-        f"(beyond lbcp: {between / decisions:.2f})\n"
+    for name in RULES:
+        measured.keep(
+            f"{title}: {name}",
+            decisions=decisions,
+            of_equilibrium=cells[name] / cells["equilibrium"],
+            of_hull_1=cells[name] / cells["hull_1"],
+            unsound=unsound[name] / max(cells[name], 1),
+            us_decision=1e6 * seconds[name] / decisions,
+        )
+    measured.keep(
+        f"{title}: linear programs",
+        a_decision=programs / decisions,
+        beyond_lbcp=between / decisions,
     )
 
 
 def main() -> None:
-    """Print the table of each setting."""
-    options = argparse.ArgumentParser(prog="python -m benchmarks.rules", description=__doc__)
-    options.add_argument("--large-bins", type=int, default=24, help="bins at 120 × 120 × 120")
-    chosen = options.parse_args()
+    """Compare the rules in each setting."""
+    measured = Measurements("rules", __doc__, seed=1)
+    add = measured.options.add_argument
+    add("--bins", type=int, default=512, help="at 10 × 10 × 10")
+    add("--large-bins", type=int, default=24, help="at 120 × 120 × 120")
+    chosen = measured.parse()
     torch.set_num_threads(1)
-    compare("RS, 10³, random play", SMALL, "random", 512, 60)
-    compare("RS, 10³, DBLF", SMALL, "dblf", 512, 60)
-    compare("120³, sides 6–60, random play", LARGE, "random", chosen.large_bins, 30)
+    compare(measured, "RS, random play", SMALL, "random", chosen.bins, 60)
+    compare(measured, "RS, DBLF", SMALL, "dblf", chosen.bins, 60)
+    compare(measured, "120³, random play", LARGE, "random", chosen.large_bins, 30)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
-"""Measure the best CPU time of a function, and print tables of results."""
+"""Measure the best CPU time of a function."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 
 def best_time(work: Callable[[], object], repeats: int = 7, device: str = "cpu") -> float:
@@ -37,16 +35,6 @@ def best_time(work: Callable[[], object], repeats: int = 7, device: str = "cpu")
             torch.cuda.synchronize()
         best = min(best, (clock() - start) / calls)
     return best
-
-
-def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table of results."""
-    table = Table(title=title)
-    for k, column in enumerate(columns):
-        table.add_column(column, justify="right" if k else "left")
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
 
 
 def devices() -> list[str]:

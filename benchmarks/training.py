@@ -1,6 +1,6 @@
 """Measure the speed of training: ``python -m benchmarks.training``.
 
-Prints items per second of whole PPO iterations, rollout and update (the best of several, as
+Measures items per second of whole PPO iterations, rollout and update (the best of several, as
 disturbances only slow them), and the share of each part: the game with its masks, networks
 (forward, backward, optimiser), rsl_rl's own code (storage, minibatches, advantages, loss), and the
 rest.
@@ -16,21 +16,16 @@ from typing import Any
 
 import torch
 
-from benchmarks.timing import devices, show
+from benchmarks.record import Measurements
+from benchmarks.timing import devices
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.config import parse
 from marl_pack.training.assembly import make_runner
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+TRAINED = ("paper", "rs")
+"""Names of the configs whose training is measured."""
 PARTS = ("game", "networks", "rsl_rl", "rest")
-
-OTHERS = (
-    ("Zhao 2021, their trainer", "123 – 132"),
-    ("PCT, setting 1", "129 – 138"),
-    ("PCT, setting 2 (no stability)", "246 – 254"),
-)
-"""Steps per CPU-second of other trainers' whole loops, each in its own code, on one core of one
-2-core machine."""
 
 
 class Split:
@@ -126,20 +121,18 @@ def measure(
 
 
 def main() -> None:
-    """Measure training and print the table."""
+    """Measure the training of each config."""
+    measured = Measurements("training", __doc__, seed=0)
+    add = measured.options.add_argument
+    add("--seconds", type=float, default=20.0, help="that each row takes at least (default: 20)")
+    chosen = measured.parse()
     torch.set_num_threads(1)
-    rows = []
     for device in devices():
-        for config in ("paper", "rs"):
+        for config in TRAINED:
             for bins in (256, 1024) if device == "cpu" else (4096, 16384):
-                rate, shares = measure(config, device, bins, 20.0)
-                rows.append(
-                    [f"{config}, N = {bins:,}", device, f"{rate:,.0f}"]
-                    + [f"{100 * shares[part]:.1f} %" for part in PARTS]
-                )
-    rows += [[name, "cpu, reported", rate, "", "", "", ""] for name, rate in OTHERS]
-    columns = ["", "device", "items/s", *PARTS]
-    show("training, 10 × 10 × 10, RS, one core", columns, rows)
+                rate, shares = measure(config, device, bins, chosen.seconds)
+                key = f"{config}, N = {bins:,}, {device}"
+                measured.keep(key, items_per_second=rate, **shares)
 
 
 if __name__ == "__main__":

@@ -54,6 +54,24 @@ CHANGES = {
     + both("planes=[resting_height,waste,grounded]"),
 }
 """What is changed, in the order of importance."""
+WORDS = {
+    "none": "none",
+    "no_afterstate_value": "without the plane `afterstate_value`",
+    "orientation_first": "only placement learns; items as they come",
+    "placement_dblf": "only orientation learns; cells by `dblf`",
+    "joint": "one agent learns pairs (orientation, cell)",
+    "orientation_random": "only placement learns; orientations at random",
+    "placement_random": "only orientation learns; cells at random",
+    "no_feasible_planes": "without the planes `afterstate_value` and `feasible_*`",
+    "papers_channels": "the paper's four channels alone",
+    "clone_max_feasible": "both clone `max_feasible` for 20 of the 80 iterations",
+    "beta_0": "no penalty for waste (`--game.beta 0`)",
+    "entropy_0.005": "less entropy at first (`--ppo.entropy_coef 0.005`)",
+    "one_epoch": "`--ppo.num_learning_epochs 1`",
+    "hull_1": "masks by `hull_1`",
+    "no_orientation_mask": "orientations not masked, nor shown",
+}
+"""What the changes are called on the page."""
 
 
 def key_of(change: str, seed: int) -> str:

@@ -1,0 +1,219 @@
+"""Make docs/results.md of the figures in results/: ``python -m experiments.page``.
+
+The page's text stands in ``experiments/results.md.jinja``, its figures in the JSON files that the
+programs of ``experiments/`` and ``benchmarks/`` write.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
+from experiments import ablations, packing, physics, planning
+from experiments.rows import main_of, mean
+from marl_pack.files import write_atomically
+from marl_pack.physics import table1
+from marl_pack.stability import RULES
+
+PAGE = ROOT / "docs" / "results.md"
+TEMPLATE = "results.md.jinja"
+RS = "models/rs.pt"
+POLICIES = {
+    RS: "`models/rs.pt`, trained on RS",
+    "models/cut_1.pt": "`models/cut_1.pt`, trained on CUT-1",
+    "models/cut_2.pt": "`models/cut_2.pt`, trained on CUT-2",
+    "models/types125.pt": "`models/types125.pt`, trained on 125 types",
+    **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
+}
+"""What the rows of the first table are called."""
+
+
+def render(folder: Path = RESULTS) -> str:
+    """Return the page.
+
+    Args:
+        folder: of the JSON files.
+
+    Raises:
+        ValueError: if figures are missing; names the commands that measure them.
+    """
+    missing = [name for name in PROGRAMS if not Results(name, folder).path.is_file()]
+    if missing:
+        commands = ", ".join(f"`{made_by(name)}`" for name in missing)
+        raise ValueError(f"{folder}: figures are missing; run {commands}")
+    environment = Environment(
+        loader=FileSystemLoader(ROOT / "experiments"), undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False,
+    )  # fmt: skip
+    environment.filters |= {
+        "percent": percent, "signed": signed, "grouped": grouped, "number": number,
+        "plain": plain, "utilization": utilization,
+    }  # fmt: skip
+    tables = {name: Results(name, folder) for name in PROGRAMS}
+    return environment.get_template(TEMPLATE).render(
+        {name: tables[name].row for name in ("other_rules", "masks", "room", "game")},
+        rules_row=tables["rules"].row,
+        training_rows=sorted(
+            tables["training"].rows().items(), key=lambda row: row[1]["items_per_second"]
+        ),
+        made=lambda name: made(tables[name]),
+        packing_table=packing_table(tables["packing"]),
+        sets=packing.SETS,
+        rs=tables["packing"].row(f"--policy {RS} {packing.SETS['RS']}"),
+        symmetric=tables["packing"].row(f"--policy {RS} --symmetric {packing.SETS['RS']}"),
+        rs_items=packing.SETS["RS"],
+        bodies_rows=[(key.partition("--seed 1")[2].strip(), tables["bodies"].row(key))
+                     for key in packing.TABLES["bodies"]],
+        rules=[rule for rule in RULES if rule != "none"],
+        plans=[(plan, tables["planning"].row(f"{RS}, {plan}"))
+               for plan in (planning.NONE, *planning.PLANS)],
+        curves=tables["learning_curve"].rows(),
+        order=("rs", "cut_1", "cut_2", "types125"),
+        spreads=tables["volume_spread"].rows(),
+        greedy=tables["afterstates"].rows(),
+        ablations_table=ablations_table(tables["ablations"]),
+        controls_report=controls_report(tables["controls"]),
+        table1_rows=[(key, tables["table1"].row(key)) for key in physics.TABLE1],
+        paper_table1=table1.PAPER,
+        reported=reported(),
+    )  # fmt: skip
+
+
+def percent(share: float | Mapping[str, float], digits: int = 2) -> str:
+    """Return a share in per cent, or a mean with its interval, as text."""
+    if isinstance(share, Mapping):
+        return f"{100 * share['mean']:.{digits}f} ± {100 * share['half']:.{digits}f}"
+    return f"{100 * share:.{digits}f}"
+
+
+def signed(share: Mapping[str, float]) -> str:
+    """Return a difference with its interval in points, as text."""
+    return f"{100 * share['mean']:+.2f} ± {100 * share['half']:.2f}".replace("-", "−")
+
+
+def grouped(number: float, digits: int = 0) -> str:
+    """Return a number with its thousands grouped."""
+    return f"{number:,.{digits}f}"
+
+
+def number(value: float, form: str) -> str:
+    """Return a number in a format of Python's, with a minus sign."""
+    return format(value, form).replace("-", "−")
+
+
+def plain(value: float) -> str:
+    """Return a small number without an exponent."""
+    return np.format_float_positional(value, 2, fractional=False, trim="-")
+
+
+def utilization(row: Mapping[str, Any]) -> str:
+    """Return a row's utilization with its interval, in per cent."""
+    low, high = row["interval"]
+    return percent({"mean": row["utilization"], "half": (high - low) / 2})
+
+
+def made(table: Results) -> str:
+    """Return the command of a table, and what its rows were made with."""
+    records = [row["record"] for row in table.rows().values()]
+
+    def all_of(name: str) -> str:
+        return ", ".join(sorted({str(r[name]) for r in records}))
+
+    seeds = sorted({seed for r in records for seed in r["seeds"].split(", ") if seed})
+    threads = all_of("threads")
+    words = [
+        all_of("cpu"),
+        f"{threads} thread" + "s" * (threads != "1"),
+        *([f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}"] if seeds else []),
+        f"commit {all_of('commit')}",
+        all_of("date"),
+    ]
+    return f"`{made_by(table.name)}` ({', '.join(words)})"
+
+
+def packing_table(table: Results) -> list[dict[str, Any]]:
+    """Return a row for each policy: utilization by set, equilibrium and falls over all sets."""
+    lines = []
+    for policy, name in POLICIES.items():
+        rows = {
+            items: table.row(f"--policy {policy} {options}")
+            for items, options in packing.SETS.items()
+            if policy in (*packing.MODELS[items], *packing.HEURISTICS)
+        }
+        lines.append({
+            "name": name,
+            "learned": policy.endswith(".pt"),
+            "cells": {items: f"{utilization(row)} ({row['packed']:.1f})"
+                      for items, row in rows.items()},
+            **judgement(rows.values()),
+        })  # fmt: skip
+    return lines
+
+
+def judgement(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the share of packings in equilibrium, and what physics said of those judged."""
+    rows = list(rows)
+    packings = sum(row["episodes"] for row in rows)
+    judged = sum(row.get("judged_episodes", 0) for row in rows)
+    placements = sum(row.get("judged", 0) for row in rows)
+    all_of = f" of {packings:,}" if judged < packings else ""
+    return {
+        "equilibrium": sum(row["episodes"] * row["strict_equilibrium"] for row in rows) / packings,
+        "judged": f"{placements:,} in {judged:,}{all_of}" if judged else "none",
+        "falls": sum(row.get("falls", 0) for row in rows) if judged else "",
+    }
+
+
+def ablations_table(table: Results) -> list[dict[str, Any]]:
+    """Return a row for each change that all seeds have been trained with.
+
+    Raises:
+        ValueError: unless there are runs without a change, which the others are compared with.
+    """
+    rows = table.rows()
+    lines: list[dict[str, Any]] = []
+    first = None
+    for change in ablations.CHANGES:
+        keys = [ablations.key_of(change, seed) for seed in ablations.SEEDS]
+        if first is None:
+            runs = [table.row(key) for key in keys]
+        elif all(key in rows for key in keys):
+            runs = [rows[key] for key in keys]
+        else:
+            continue
+        values = np.array([run["utilization"] for run in runs])
+        first = values if first is None else first
+        lines.append({
+            "name": ablations.WORDS[change], "items": runs[0]["items"],
+            "utilization": mean(values), "each": ", ".join(map(percent, values)),
+            "difference": mean(values - first) if lines else None,
+        })  # fmt: skip
+    return lines
+
+
+def controls_report(table: Results) -> dict[str, Any]:
+    """Return how many controls were judged right, and where verdicts flip."""
+    report = table.row(physics.CONTROLS)
+    outcomes = report["controls"]
+    right = {of: sum(o[of] == o["known"] for o in outcomes)
+             for of in ("judge", "equilibrium", "everything")}  # fmt: skip
+    flips = [at for at in report["flips_at_mm"].values() if at is not None]
+    return {"number": len(outcomes), **right, "outside": -min(flips), "inside": max(0, *flips)}
+
+
+def main() -> int:
+    """Write the page; return the exit status."""
+    text = render()
+    write_atomically(PAGE, lambda file: file.write(text.encode()))
+    print(f"{PAGE}: {len(text.splitlines())} lines")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main_of(main))
