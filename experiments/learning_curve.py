@@ -25,6 +25,10 @@ MODELS = ROOT / "models"
 OTHERS = ("cut_1_first", "cut_1_second", "cut_1_third", "cut_1_fourth", "cut_1", "cut_2_first",
           "cut_2_second", "cut_2", "types125")  # fmt: skip
 
+CPUS = {"types125": "AMD EPYC"}
+"""Where runs were trained that were not trained on the usual machine."""
+CPU = "Intel Xeon with AVX-512"
+
 
 def history(run: Path) -> Any:
     """Return the rows of a run's evaluations, as a structured array."""
@@ -109,10 +113,10 @@ def main() -> int:
     draw([MODELS / "rs.csv"], ROOT / "docs" / "learning_curve.png", others)
     rest = [MODELS / f"{name}.csv" for name in OTHERS]
     draw(rest, ROOT / "docs" / "learning_curve_others.png", {})
-    made = record("python -m experiments.learning_curve")
     results = Results("learning_curve")
     for run in (MODELS / "rs.csv", *rest):
         own = figures(run, others if run.stem == "rs" else {})
+        made = record("python -m experiments.learning_curve", cpu=CPUS.get(run.stem, CPU))
         results.put(run.stem, own, made)
     return 0
 

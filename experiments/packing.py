@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,9 @@ PART = 50
 """How many packings are judged before the figures are written."""
 
 
-def measure(results: Results, key: str, physics: bool, processes: int) -> None:
+def measure(
+    results: Results, key: str, physics: bool, processes: int = 1, kept: Path = KEPT
+) -> None:
     """Play the policy of a row and judge its packings, unless that is done.
 
     Args:
@@ -78,6 +81,7 @@ def measure(results: Results, key: str, physics: bool, processes: int) -> None:
         key: options of ``marl_pack.evaluate``, without ``--physics``.
         physics: whether to judge.
         processes: that judge at once.
+        kept: folder of the plans that are still to be judged.
     """
     console = make_console()
     options = expanded(key) + ["--physics", "--processes", str(processes)] * physics
@@ -87,7 +91,8 @@ def measure(results: Results, key: str, physics: bool, processes: int) -> None:
     episodes, bodies = evaluate.check_options(arguments, setup)
     command = f"python -m marl_pack.evaluate {key}" + " --physics" * physics
     row = results.rows().get(key)
-    plans_file = KEPT / f"{re.sub(r'[^A-Za-z0-9.]+', '_', key).strip('_')}.npz"
+    kept.mkdir(parents=True, exist_ok=True)
+    plans_file = kept / f"{re.sub(r'[^A-Za-z0-9.]+', '_', key).strip('_')}.npz"
     with make_progress(console) as bar:
         plans: list[Plan] | None = None
         if row is None or (physics and not plans_file.is_file() and not judged(row)):
@@ -147,7 +152,6 @@ def main() -> int:
     add("--physics", action="store_true", help="judge the packings of every table")
     add("--processes", type=int, default=1, help="that judge at once (default: 1)")
     chosen = rows.parse()
-    KEPT.mkdir(parents=True, exist_ok=True)
     for table in chosen.tables:
         results, physics = rows.results(table), chosen.physics or table == "bodies"
 

@@ -162,11 +162,13 @@ def judgement(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     packings = sum(row["episodes"] for row in rows)
     judged = sum(row.get("judged_episodes", 0) for row in rows)
     placements = sum(row.get("judged", 0) for row in rows)
+    unclear = sum(row.get("no_verdict", 0) for row in rows)
     all_of = f" of {packings:,}" if judged < packings else ""
     return {
         "equilibrium": sum(row["episodes"] * row["strict_equilibrium"] for row in rows) / packings,
         "judged": f"{placements:,} in {judged:,}{all_of}" if judged else "none",
-        "falls": sum(row.get("falls", 0) for row in rows) if judged else "",
+        "falls": str(sum(row.get("falls", 0) for row in rows)) * bool(judged)
+        + f" ({unclear} without a verdict)" * bool(unclear),
     }
 
 
