@@ -23,12 +23,12 @@ from marl_pack.stability import RULES
 
 PAGE = ROOT / "docs" / "results.md"
 TEMPLATE = "results.md.jinja"
-RS = "models/rs.pt"
+RS = "rs"
 POLICIES = {
-    RS: "`models/rs.pt`, trained on RS",
-    "models/cut_1.pt": "`models/cut_1.pt`, trained on CUT-1",
-    "models/cut_2.pt": "`models/cut_2.pt`, trained on CUT-2",
-    "models/types125.pt": "`models/types125.pt`, trained on 125 types",
+    RS: "`rs`, trained on RS",
+    "cut_1": "`cut_1`, trained on CUT-1",
+    "cut_2": "`cut_2`, trained on CUT-2",
+    "types125": "`types125`, trained on 125 types",
     **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
 }
 """What the rows of the first table are called."""
@@ -148,7 +148,7 @@ def packing_table(table: Results) -> list[dict[str, Any]]:
         }
         lines.append({
             "name": name,
-            "learned": policy.endswith(".pt"),
+            "learned": policy not in packing.HEURISTICS,
             "cells": {items: f"{utilization(row)} ({row['packed']:.1f})"
                       for items, row in rows.items()},
             **judgement(rows.values()),
