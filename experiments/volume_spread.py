@@ -93,12 +93,12 @@ def main() -> int:
         figures = {
             "items": chosen.items, "episodes": stream.episodes,
             "rank_correlation": float(rank.statistic), "p": float(rank.pvalue),
-            "points_per_10_cells": {"mean": 10 * line.slope, "half": 19.6 * line.stderr},
+            "points_per_10_cells": {"mean": float(10 * line.slope), "half": float(19.6 * line.stderr)},
             "first_eighth": groups[0]["mean"], "last_eighth": groups[-1]["mean"],
         }  # fmt: skip
         command = f"python -m experiments.volume_spread {shlex.join(chosen.policies)}"
         Results("volume_spread").put(policy, figures, record(command))
-        print(policy, figures)
+        print(f"{policy}: rank correlation {rank.statistic:+.3f} (p = {rank.pvalue:.2g})")
     panel.set_xlabel("standard deviation of the item volumes of a sequence, cells")
     panel.set_ylabel("utilization, %")
     panel.grid(alpha=0.3)
