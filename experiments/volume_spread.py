@@ -90,10 +90,11 @@ def main() -> int:
         panel.errorbar(middle, centres, halves, marker="o", markersize=3, capsize=2, label=policy,
                        color=f"C{p}")  # fmt: skip
         rank, line = stats.spearmanr(spread, reached), stats.linregress(spread, reached)
+        slope = {"mean": float(10 * line.slope), "half": float(19.6 * line.stderr)}
         figures = {
             "items": chosen.items, "episodes": stream.episodes,
             "rank_correlation": float(rank.statistic), "p": float(rank.pvalue),
-            "points_per_10_cells": {"mean": float(10 * line.slope), "half": float(19.6 * line.stderr)},
+            "points_per_10_cells": slope,
             "first_eighth": groups[0]["mean"], "last_eighth": groups[-1]["mean"],
         }  # fmt: skip
         command = f"python -m experiments.volume_spread {shlex.join(chosen.policies)}"
