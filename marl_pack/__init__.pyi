@@ -1,19 +1,17 @@
 # The public interface: __init__.py imports these names at their first use.
 
-from .agents.heuristics import make_policy as make_policy
 from .agents.keys import POLICIES as POLICIES
-from .agents.loading import Loader as Loader
+from .agents.player import Player as Player
+from .agents.player import load as load
 from .agents.policy import Policy as Policy
-from .agents.search import Planner as Planner
 from .agents.search import SearchSettings as SearchSettings
-from .backend import Backend as Backend
+from .bins import Bins as Bins
 from .env_aec import env as env
 from .env_aec import parallel_env as parallel_env
-from .evaluation.rollout import Rollout as Rollout
-from .game.moves import Moves as Moves
+from .env_aec import raw_env as raw_env
+from .evaluation.statistics import strict_equilibrium as strict_equilibrium
 from .game.packing import Packing as Packing
 from .game.spec import GameSpec as GameSpec
-from .game.state import GameState as GameState
 from .game.turns import Outcome as Outcome
 from .geometry import ORIENTATIONS as ORIENTATIONS
 from .items import Items as Items

@@ -164,7 +164,7 @@ def check_device(device: torch.device | str) -> torch.device:
     """
     try:
         checked = torch.device(device)
-    except RuntimeError:  # its text lists two dozen kinds of devices
+    except (RuntimeError, TypeError):  # its text lists two dozen kinds of devices
         checked = torch.device("meta")
     try:
         if checked.type not in ("cpu", "cuda"):

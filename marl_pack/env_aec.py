@@ -42,7 +42,7 @@ import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ from pettingzoo.utils.conversions import (
 
 from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameSpec, document, with_options
+from marl_pack.game.spec import GameOptions, GameSpec, document, with_options
 from marl_pack.game.state import Copied
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
@@ -69,23 +69,38 @@ TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
 RENDER_MODES = ["human", "rgb_array", "ansi"]
 
 
-def env(*, illegal_reward: float = -1.0, **kwargs: Any) -> AECEnv:
+class Options(GameOptions, total=False):
+    """The keyword arguments of :class:`raw_env`; its signature has their defaults."""
+
+    bin_size: tuple[int, int, int]
+    items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream
+    sides: tuple[int, int]
+    max_cycles: int | None
+    render_mode: str | None
+    pad_actions: bool
+    mask_in: str
+    illegal: str
+
+
+def env(*, illegal_reward: float = -1.0, **options: Unpack[Options]) -> AECEnv:
     """Return the environment in PettingZoo's usual wrappers.
 
     Args:
         illegal_reward: reward of the agent that ends the game by an illegal action (only with
             ``illegal="terminate"``).
-        **kwargs: of :class:`raw_env`.
+        **options: ``bin_size``, ``items``, ``rule``, … as :class:`raw_env` describes them.
     """
     illegal_reward = real_number(illegal_reward, "illegal_reward")
-    environment: AECEnv = raw_env(**kwargs)
+    environment: AECEnv = raw_env(**options)
     if environment.unwrapped.illegal == "terminate":
         environment = wrappers.TerminateIllegalWrapper(environment, illegal_reward=illegal_reward)
     environment = wrappers.AssertOutOfBoundsWrapper(environment)
     return OrderEnforcing(environment)
 
 
-def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
+def parallel_env(
+    *, simultaneous: bool = False, illegal_reward: float = -1.0, **options: Unpack[Options]
+) -> Any:
     """Return the environment in PettingZoo's parallel API.
 
     By default one step is one turn: all agents may send actions, only that of the acting agent
@@ -99,14 +114,14 @@ def parallel_env(*, simultaneous: bool = False, **kwargs: Any) -> Any:
 
     Args:
         simultaneous: see above.
-        **kwargs: of :func:`env`.
+        illegal_reward, **options: as :func:`env` takes them.
 
     Raises:
         ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
     """
-    if truth_value(simultaneous, "simultaneous") and kwargs.get("illegal") != "repair":
+    if truth_value(simultaneous, "simultaneous") and options.get("illegal") != "repair":
         raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
-    return (AtOnce if simultaneous else Turns)(env(**kwargs))
+    return (AtOnce if simultaneous else Turns)(env(illegal_reward=illegal_reward, **options))
 
 
 class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
@@ -226,7 +241,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         pad_actions: bool = False,
         mask_in: str = "observation",
         illegal: str = "terminate",
-        **options: Any,
+        **options: Unpack[GameOptions],
     ) -> None:
         super().__init__()
         _one_of("mask_in", mask_in, ("observation", "info"))
@@ -268,6 +283,16 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._orientation_played = np.zeros(1, np.int64)
         self._cell_played = np.zeros(1, np.int64)
         self._window: Any = None  # opened by the first picture
+
+    @property
+    def game(self) -> Packing:
+        """The game that this is a view of, for players; only reset and step may change it."""
+        return self._game
+
+    @property
+    def chosen(self) -> int | None:
+        """The orientation that was chosen for the item; None in the orientation agent's turn."""
+        return self._chosen
 
     @property
     def plan(self) -> Plan:
@@ -557,4 +582,17 @@ def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
         raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")
 
 
+def _name_options(function: Any) -> None:
+    """Let a function's signature name every option that it hands on to :class:`raw_env`."""
+    named = [
+        parameter.replace(kind=parameter.KEYWORD_ONLY)
+        for parameter in inspect.signature(raw_env).parameters.values()
+    ]
+    signature = inspect.signature(function)
+    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    function.__signature__ = signature.replace(parameters=[*named, *own])
+
+
 raw_env.__signature__ = with_options(inspect.signature(raw_env), leave_out=tuple(TAKEN))
+_name_options(env)
+_name_options(parallel_env)

@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
-from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.agents.policy import InTurns, Policy
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.game.packing import Packing
@@ -25,8 +25,6 @@ from marl_pack.items import (
     GENERATED,
     Stream,
     choose_stream,
-    independent,
-    make_stream,
 )
 from marl_pack.options import MOST_AT_ONCE
 
@@ -142,7 +140,7 @@ def choose_policies(
     policies = {name: Loader(*settings).policy(name) for name in names}
     if pair[0] is not None:
         loader = Loader(*settings)
-        policies[f"{pair[0]} + {pair[1]}"] = in_turns(
+        policies[f"{pair[0]} + {pair[1]}"] = InTurns(
             loader.orientation_agent(pair[0]), loader.placement_agent(pair[1])
         )
     learned: dict[str, Any] = {}
@@ -170,7 +168,7 @@ def with_search(
         ValueError: if the settings cannot be read, or there is no checkpoint to search with.
     """
     from marl_pack.agents.learning import checkpoint as checkpoints
-    from marl_pack.agents.loading import Loader, trained_game
+    from marl_pack.agents.loading import Loader, imagined_stream
     from marl_pack.agents.search import SearchSettings
 
     settings = SearchSettings.parse(arguments.plan)
@@ -182,14 +180,10 @@ def with_search(
             policies_with_search[name] = policy
             continue
         checkpoint = checkpoints.read(name, arguments.device)
-        game = trained_game(checkpoint)
-        learned = stream
-        if game["items"] in GENERATED:
-            try:
-                learned = make_stream(game["items"], size, tuple(game["sides"]))
-            except ValueError as error:
-                raise ValueError(f"--plan: items of the agents' training: {error}") from None
-        futures = independent(learned).to(arguments.device)
+        try:
+            futures = imagined_stream(checkpoint, size, stream).to(arguments.device)
+        except ValueError as error:
+            raise ValueError(f"--plan: {error}") from None
         loader = Loader(arguments.device, arguments.seed, arguments.symmetric)
         policies_with_search[f"{name}, {settings}"] = loader.planner(checkpoint, settings, futures)
     return policies_with_search

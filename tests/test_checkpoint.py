@@ -8,7 +8,7 @@ import torch
 
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader, load_actor, load_afterstate_critic, record_of
-from marl_pack.agents.policy import in_turns
+from marl_pack.agents.policy import InTurns
 from marl_pack.agents.search import SearchSettings
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
@@ -44,7 +44,7 @@ def test_a_policy_is_rebuilt_from_its_file_on_any_bin(runs: Path, symmetric: boo
 def test_agents_of_different_sources_play_together(runs: Path) -> None:
     game = Packing(16)
     loader = Loader()
-    policy = in_turns(
+    policy = InTurns(
         loader.orientation_agent(str(runs / "joint")),
         loader.placement_agent(str(runs / "both" / "latest.pt")),
     )

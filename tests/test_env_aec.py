@@ -1,9 +1,11 @@
+import inspect
 import pickle
 import warnings
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pettingzoo
@@ -22,6 +24,7 @@ from pettingzoo.utils import wrappers
 
 from marl_pack import env_aec
 from marl_pack.game.packing import Packing
+from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS
 
 O, P = "orientation_0", "placement_0"  # noqa: E741  # the two agents
@@ -35,6 +38,18 @@ VARIANTS: list[dict[str, Any]] = [
     {"bin_size": (8, 5, 12), "items": "cut2", "sides": (1, 4), "rule": "lbcp"},
     {"bin_size": (1, 2, 9), "sides": (1, 1), "pad_actions": True},
 ]
+
+
+@pytest.mark.parametrize("make", [env_aec.env, env_aec.parallel_env, env_aec.raw_env])
+def test_the_signature_names_every_option_with_its_default(make: Any) -> None:
+    parameters = inspect.signature(make).parameters
+    for option in fields(GameSpec):
+        assert parameters[env_aec.TAKEN.get(option.name, option.name)].default == option.default
+    # What type checkers and editors read names the same arguments.
+    assert set(get_type_hints(env_aec.Options)) == set(
+        inspect.signature(env_aec.raw_env).parameters
+    )
+    assert set(parameters) >= set(get_type_hints(env_aec.Options))
 
 
 def mask_of(env: Any, agent: str) -> np.ndarray:

@@ -16,7 +16,7 @@ from marl_pack.agents.heuristics import (
 )
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
-from marl_pack.agents.policy import Policy, in_turns
+from marl_pack.agents.policy import InTurns, Policy
 from marl_pack.agents.search import Planner, SearchSettings
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
@@ -92,7 +92,7 @@ def test_a_branch_of_games_that_restart_ends_with_its_episode() -> None:
 
 
 def test_searching_beats_the_same_agents_without(agents: Agents) -> None:
-    alone = in_turns(*agents)
+    alone = InTurns(*agents)
     planner = Planner(*agents, None, SearchSettings(rollouts=3, top=6), FUTURES)
     assert utilization(planner) > utilization(alone) + 0.03
 
@@ -109,7 +109,7 @@ def test_a_critic_may_value_the_rest_after_a_depth(agents: Agents) -> None:
 
     settings = SearchSettings(rollouts=2, top=6, depth=1)
     planner = Planner(*agents, FlatTops(), settings, FUTURES)  # type: ignore[arg-type]  # a stand-in
-    assert utilization(planner) > utilization(in_turns(*agents)) + 0.03
+    assert utilization(planner) > utilization(InTurns(*agents)) + 0.03
     assert max(batches) > 6  # pairs times futures times games
 
 
@@ -209,7 +209,7 @@ def test_orientations_that_give_the_same_box_count_as_one(
 
     def proposed(**options: Any) -> list[int]:
         cube = Packing(1, (4, 4, 4), [[3, 3, 3]], auto_reset=False, **options)
-        pairs, legal = planner._propose(cube, torch.tensor([0]))
+        pairs, legal = planner._propose(cube, torch.tensor([0]), cube.moves)
         proposals: list[int] = pairs[legal].tolist()
         assert len(set(proposals)) == len(proposals)
         return proposals

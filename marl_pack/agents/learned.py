@@ -11,6 +11,8 @@ from marl_pack.agents.networks.distribution import check_outputs
 from marl_pack.agents.networks.kinds import observe
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.agents.networks.symmetry import mean_probabilities
+from marl_pack.agents.policy import Placement
+from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 
 
@@ -55,3 +57,27 @@ class LearnedAgent:
         if self.symmetric:
             return self.probabilities(observation).argmax(1)
         return self.best(observation)
+
+
+class JointPolicy:
+    """The policy of a learned joint agent, which chooses orientation and cell at once.
+
+    Args:
+        agent: the agent.
+    """
+
+    def __init__(self, agent: LearnedAgent) -> None:
+        self.agent = agent
+
+    @torch.inference_mode()
+    def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
+        """Return the most probable placement of each game, int64 [G] each.
+
+        Args:
+            game: the games.
+            moves: to choose among; all legal ones by default.
+        """
+        if moves is None:
+            return game.floor.split(self.agent(game))
+        probabilities = self.agent.probabilities(self.agent.observe(game))
+        return moves.least(-probabilities.view_as(moves.mask))

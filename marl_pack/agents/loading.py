@@ -19,20 +19,21 @@ from marl_pack.agents.heuristics import (
     make_policy,
 )
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
-from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.learned import JointPolicy, LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.form import check_alike
 from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.networks.kinds import JOINT, ORIENTATION, PLACEMENT
 from marl_pack.agents.policy import (
+    InTurns,
     OrientationAgent,
     PlacementAgent,
     Policy,
-    in_turns,
 )
 from marl_pack.agents.search import Planner, SearchSettings
 from marl_pack.game.spec import GameSpec
-from marl_pack.items import Stream
+from marl_pack.geometry import Size
+from marl_pack.items import GENERATED, Stream, independent, make_stream
 
 
 class Loader:
@@ -58,7 +59,7 @@ class Loader:
 
     # --- by name or path --------------------------------------------------------------------------
 
-    def policy(self, source: str) -> Policy:
+    def policy(self, source: str | Path) -> Policy:
         """Return the policy that ``source`` names.
 
         Args:
@@ -68,7 +69,7 @@ class Loader:
         Raises:
             ValueError, FileNotFoundError: if it is none of these.
         """
-        if source in POLICIES:
+        if isinstance(source, str) and source in POLICIES:
             return make_policy(source, self.seed, self.device)
         checkpoint = checkpoints.read(_path(source, POLICIES), self.device)
         with _named(source):
@@ -103,9 +104,8 @@ class Loader:
     def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
         """Return the whole policy of a checkpoint, frozen agents included."""
         if JOINT in checkpoint["agents"]:
-            agent = self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT)
-            return lambda game: game.floor.split(agent(game))
-        return in_turns(
+            return JointPolicy(self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT))
+        return InTurns(
             self.orientation_agent_of(checkpoints.agent_record(checkpoint, ORIENTATION)),
             self.placement_agent_of(checkpoints.agent_record(checkpoint, PLACEMENT)),
         )
@@ -179,6 +179,32 @@ class Loader:
                 )
             critic = load_critic(checkpoint, ORIENTATION, self.device, first.actor)
         return Planner(first, second, critic, settings, futures, self.seed or 0)
+
+
+def imagined_stream(
+    checkpoint: Mapping[str, Any], size: Size | None = None, played: Stream | None = None
+) -> Stream:
+    """Return the stream of items that a search imagines: such as its agents were trained on.
+
+    Args:
+        checkpoint: of the agents.
+        size: of the bin; by default that of the training.
+        played: the stream to take in place of a file of the training.
+
+    Raises:
+        ValueError: if there is no such stream.
+    """
+    game = trained_game(checkpoint)
+    if game["items"] in GENERATED:
+        try:
+            played = make_stream(game["items"], size or game["bin"], tuple(game["sides"]))
+        except ValueError as error:
+            raise ValueError(f"items of the agents' training: {error}") from None
+    if played is None:
+        raise ValueError(
+            f"search: needs agents trained on one of {', '.join(GENERATED)}, not {game['items']}"
+        )
+    return independent(played)
 
 
 def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str) -> Actor:
@@ -292,20 +318,20 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _named(source: str) -> Iterator[None]:
+def _named(source: str | Path) -> Iterator[None]:
     """Put the name of a source before the errors of what it holds, once."""
     try:
         yield
     except ValueError as error:
-        named = str(error).startswith(f"{source}") or repr(source) in str(error)
+        named = str(error).startswith(f"{source}") or repr(str(source)) in str(error)
         raise ValueError(str(error) if named else f"{source}: {error}") from None
 
 
-def _path(source: str, names: Sequence[str]) -> Path:
+def _path(source: str | Path, names: Sequence[str]) -> Path:
     """Return the path of the checkpoint or the run's folder that ``source`` names.
 
     Raises:
         ValueError: if it is no path and no published model's name; says what would be right.
     """
-    renamed.refuse_old(source, renamed.POLICIES, "policy")
+    renamed.refuse_old(str(source), renamed.POLICIES, "policy")
     return published.model(source, names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,14 +25,21 @@ PlacementAgent = Callable[[Packing, Tensor], Tensor]
 """``(game, orientation int64 [G]) -> cell int64 [G]``: the second agent alone."""
 
 
-def in_turns(orientation_agent: OrientationAgent, placement_agent: PlacementAgent) -> Policy:
-    """Return the policy in which an orientation and a placement agent act in turns."""
+@dataclass(frozen=True)
+class InTurns:
+    """The policy in which an orientation and a placement agent act in turns.
 
-    def play(game: Packing) -> Placement:
-        orientation = orientation_agent(game)
-        return orientation, placement_agent(game, orientation)
+    Args:
+        orientation_agent, placement_agent: the agents.
+    """
 
-    return play
+    orientation_agent: OrientationAgent
+    placement_agent: PlacementAgent
+
+    def __call__(self, game: Packing) -> Placement:
+        """Return orientation and cell of each game, int64 [G] each."""
+        orientation = self.orientation_agent(game)
+        return orientation, self.placement_agent(game, orientation)
 
 
 def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -21,6 +21,7 @@ from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import Critic
 from marl_pack.agents.policy import Placement
 from marl_pack.checks import whole_number
+from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.items import Stream
@@ -105,15 +106,19 @@ class Planner:
         self.seed = -1 - seed  # games have seeds from 0, so real items are never foreseen
 
     @torch.inference_mode()
-    def __call__(self, game: Packing) -> Placement:
+    def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
         """Return the best pair of every game, by sequential halving (Karnin et al. 2013).
 
         Each round plays the same number of futures in all. The better half of the pairs goes to the
         next round, until one is left.
+
+        Args:
+            game: the games.
+            moves: to choose among; all legal ones by default.
         """
         best = torch.zeros(game.n, dtype=torch.int64, device=game.device)
         games = game.alive.nonzero().squeeze(1)  # [B]
-        pairs, legal = self._propose(game, games)  # [B, M]
+        pairs, legal = self._propose(game, games, moves or game.moves)  # [B, M]
         total, played = torch.zeros(pairs.shape, dtype=torch.float64, device=game.device), 0
         rounds = max(1, math.ceil(math.log2(self.settings.top)))
         for rounds_left in range(rounds, 0, -1):
@@ -162,8 +167,8 @@ class Planner:
         numbers = decision * self.settings.top * self.settings.rollouts + first
         return numbers[:, None] + torch.arange(k, device=games.device)
 
-    def _propose(self, game: Packing, games: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the M most probable pairs of the games [B], and which of them are legal.
+    def _propose(self, game: Packing, games: Tensor, moves: Moves) -> tuple[Tensor, Tensor]:
+        """Return the M most probable of the moves in the games [B], and which of them are legal.
 
         Returns:
             int64 [B, M], and bool [B, M]: false at the end of rows with fewer than M legal pairs.
@@ -180,7 +185,7 @@ class Planner:
             observation = self.placement_agent.observe(branch, orientations.repeat(len(part)))
             second = self.placement_agent.probabilities(observation)  # [b · 6, W · D]
             joint.append(first[:, :, None] * second.view(-1, count, cells))
-        legal = game.mask[games].flatten(2)
+        legal = moves.mask[games].flatten(2)
         same = _same_boxes(game)[games].double()
         merged = torch.einsum("noe,nec->noc", same, torch.cat(joint) * legal)
         before = torch.einsum("noe,nec->noc", same.tril(-1), legal.double())

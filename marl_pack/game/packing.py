@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from numpy.typing import ArrayLike
@@ -27,7 +27,7 @@ from marl_pack.bins import UNKNOWN, Bins, check_device
 from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game import invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides_tensor
-from marl_pack.game.spec import GameSpec, document
+from marl_pack.game.spec import GameOptions, GameSpec, document
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.geometry import ALL_ORIENTATIONS
@@ -99,12 +99,12 @@ class Packing(Copied):
         backend: Backend | None = None,
         seed: int = 0,
         first_episode: int = 0,
-        **options: Any,
+        **options: Unpack[GameOptions],
     ) -> None:
         if not (spec is None or isinstance(spec, GameSpec)):
             raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
-        options |= {} if bin is None else {"bin": bin}
-        self.spec = (spec or GameSpec()).with_options(options)
+        bin_option = {} if bin is None else {"bin": bin}
+        self.spec = (spec or GameSpec()).with_options({**options, **bin_option})
         self.n = n = whole_number(n, "n, at least one game", 1, MOST_GAMES)
         self.auto_reset = truth_value(auto_reset, "auto_reset")
         self.checked = invariants.wanted()

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Integral
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 from marl_pack import renamed
 from marl_pack.checks import real_number, shown, truth_value
@@ -263,6 +263,20 @@ class GameSpec:
     def __str__(self) -> str:
         """Describe the game, such as ``bin 10 x 10 x 10, rule hull_alpha, margin 1``."""
         return ", ".join(self.phrases())
+
+
+class GameOptions(TypedDict, total=False):
+    """The options of :class:`GameSpec` but the bin, as keyword arguments that editors know."""
+
+    rule: str | Rule
+    margin: float | None
+    thresholds: str | None
+    orientations: Sequence[int]
+    mask_orientations: bool
+    alpha: float
+    beta: float
+    com_offset: Sequence[float]
+    max_items: int | None
 
 
 def document(indent: str) -> Callable[[T], T]:

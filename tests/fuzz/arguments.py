@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 import marl_pack
+from marl_pack import SearchSettings
 from marl_pack.env_aec import raw_env
 from marl_pack.stability import in_equilibrium, make_rule, stable_mask
 
@@ -37,7 +38,7 @@ def _stack() -> dict[str, Any]:
 def _play(**options: Any) -> None:
     """Play two turns with a game of these options."""
     games = marl_pack.Packing(**options)
-    policy = marl_pack.make_policy("dblf")
+    policy = marl_pack.load("dblf")
     for _ in range(2):
         games.place(*policy(games))
 
@@ -90,7 +91,11 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "raw_env step": (_step, lambda: {"action": 0, "bin_size": (6, 5, 7), "sides": (2, 3)}),
     "reset": (_reset, lambda: {"seed": 1, "options": {"items": [[2, 2, 2], [3, 3, 3]]}}),
     "place": (_place, lambda: {"orientation": torch.tensor([0, 0]), "cell": torch.tensor([0, 0])}),
-    "policy": (marl_pack.make_policy, lambda: {"name": "dblf", "seed": 1}),
+    "heuristic": (marl_pack.load, lambda: {"source": "random", "seed": 1, "device": "cpu"}),
+    "model": (
+        marl_pack.load,
+        lambda: {"source": "rs", "seed": 1, "symmetric": True, "search": SearchSettings(2, 3)},
+    ),
     "rows": (
         _play,
         lambda: {"n": 2, "seed": 1, "items": {"items": [[[2, 2, 2], [3, 3, 3]]],

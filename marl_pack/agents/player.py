@@ -1,0 +1,145 @@
+"""Load a policy by name, and let it play: many games at once, or the environment turn by turn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from pettingzoo import ParallelEnv
+from torch import Tensor
+
+from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.keys import POLICIES
+from marl_pack.agents.policy import InTurns, Placement, Policy
+from marl_pack.bins import check_device
+from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
+from marl_pack.env_aec import AGENTS, AtOnce, raw_env
+from marl_pack.game.packing import Packing
+
+if TYPE_CHECKING:
+    from marl_pack.agents.search import SearchSettings
+
+
+def load(
+    source: str | Path,
+    device: torch.device | str = "cpu",
+    seed: int | None = 0,
+    *,
+    symmetric: bool = False,
+    search: SearchSettings | None = None,
+) -> Player:
+    """Return the player that ``source`` names.
+
+    Args:
+        source: a heuristic (:data:`marl_pack.agents.keys.POLICIES`), a published model such
+            as ``"rs"``, or the path of a run's folder or a checkpoint: it has a folder or a suffix,
+            as ``"./NAME"`` has.
+        device: of the games; the environment plays on the CPU.
+        seed: of random play and of the futures that a search imagines; None draws random play from
+            torch's global generator.
+        symmetric: whether learned agents are asked in all symmetries of the bin.
+        search: how far learned agents search before each placement; None: not at all. They imagine
+            items of the kind that they were trained on.
+
+    Raises:
+        ValueError, FileNotFoundError: if there is no such player, or it cannot play so.
+    """
+    device = check_device(device)
+    seed = None if seed is None else whole_number(seed, "seed", 0, LARGEST_SEED)
+    symmetric = truth_value(symmetric, "symmetric")
+    if not isinstance(source, str | Path):
+        raise ValueError(f"policy {shown(source)}: needs a name or a path")
+    if source in POLICIES:
+        if symmetric or search is not None:
+            raise ValueError(f"symmetric, search: need a learned policy, not {source}")
+        return Player(make_policy(str(source), seed, device))
+    # Learned agents need rsl_rl, which is slow to import.
+    from marl_pack.agents.learning import checkpoint as checkpoints
+    from marl_pack.agents.loading import Loader, imagined_stream
+    from marl_pack.agents.search import SearchSettings
+
+    loader = Loader(device, seed, symmetric)
+    if search is None:
+        return Player(loader.policy(source))
+    if not isinstance(search, SearchSettings):
+        raise ValueError(f"search = {shown(search)}: needs SearchSettings")
+    checkpoint = checkpoints.read(source, device)
+    try:
+        futures = imagined_stream(checkpoint).to(device)
+        return Player(loader.planner(checkpoint, search, futures))
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+
+
+class Player:
+    """A player of G games of :class:`marl_pack.game.packing.Packing`, or of the environment.
+
+    Args:
+        policy: what decides, such as :func:`marl_pack.agents.loading.load` makes it. A function of
+            your own that is asked for the second turn alone is called with the moves to choose
+            among as its second argument.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self._agents = policy if isinstance(policy, InTurns) else _TwoTurns(policy)
+
+    def __call__(self, game: Packing) -> Placement:
+        """Return the orientation and the cell of each game's item, int64 [G] each."""
+        return self.policy(game)
+
+    def act(self, env: Any) -> Any:
+        """Return the action of the agent whose turn it is, for ``env.step``.
+
+        The placement agent places the item in the orientation that was chosen, by whomever.
+
+        Args:
+            env: an environment of :mod:`marl_pack.env_aec`, in any wrappers.
+
+        Returns:
+            The action, or None for an agent that has ended; for a parallel environment a dict with
+            the actions that its step needs.
+
+        Raises:
+            ValueError: for another environment, or if no agent is left to act.
+        """
+        raw = getattr(env, "unwrapped", None)
+        if not isinstance(raw, raw_env):
+            raise ValueError(f"act: needs an environment of marl_pack.env_aec, not {shown(env)}")
+        _, _, terminated, truncated, _ = raw.last(observe=False)
+        if isinstance(env, AtOnce):
+            return {name: int(choice) for name, choice in zip(AGENTS, self(raw.game), strict=True)}
+        action = None if terminated or truncated else self._turn(raw)
+        return {raw.agent_selection: action} if isinstance(env, ParallelEnv) else action
+
+    def _turn(self, env: raw_env) -> int:
+        """Return the choice of the agent whose turn it is."""
+        if env.chosen is None:
+            return int(self._agents.orientation_agent(env.game))
+        return int(self._agents.placement_agent(env.game, torch.tensor([env.chosen])))
+
+
+class _TwoTurns:
+    """The two agents of a policy that chooses orientation and cell at once.
+
+    Args:
+        policy: it may be given the moves to choose among as a second argument.
+    """
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+        self._turn: object = None  # of the game, in which it chose
+        self._choice: Placement
+
+    def orientation_agent(self, game: Packing) -> Tensor:
+        """Choose both, and return the orientations, int64 [G]."""
+        self._turn, self._choice = game.turn, self.policy(game)
+        return self._choice[0]
+
+    def placement_agent(self, game: Packing, orientation: Tensor) -> Tensor:
+        """Return the cells, int64 [G]: those chosen before if these orientations were."""
+        if self._turn is game.turn and torch.equal(self._choice[0], orientation):
+            return self._choice[1]
+        cell: Tensor = self.policy(game, game.moves.only(orientation))[1]
+        return cell
