@@ -1,4 +1,4 @@
-"""Write a checkpoint's agents for use elsewhere: ONNX, or rsl_rl's own format.
+"""Write a checkpoint's agents for use elsewhere: ONNX, rsl_rl's own format, or to publish them.
 
 ``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
 the checkpoint, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates. Batch and
@@ -12,27 +12,33 @@ import logging
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
+from rsl_rl.utils import resolve_optimizer
 from torch import Tensor, nn
 
-from marl_pack import published
+from marl_pack import __version__, published
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning import checkpoint as checkpoints
-from marl_pack.agents.loading import load_actor, load_afterstate_critic
+from marl_pack.agents.loading import load_actor, load_afterstate_critic, load_critic
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.config import from_dict
 from marl_pack.extras import missing
 from marl_pack.files import write_atomically
 from marl_pack.game.packing import Packing
 from marl_pack.terminal import Parser, make_console
+from marl_pack.training.assembly import runner_settings
 
 OPSET = 18
+PUBLISHED = "published.pt"
+"""The file of a checkpoint to publish."""
 
 
 class Exported(nn.Module):
@@ -143,8 +149,6 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
     if form == "rsl_rl":
         if "critic_state_dict" not in agent:
             return f"{name}: frozen, so it has no critic that rsl_rl could load"
-        if "optimizer_state_dict" not in agent:
-            raise ValueError(f"agents.{name}.optimizer_state_dict is missing")
         checkpoints.check_weights(agent, name)
         path = folder / f"{name}.pt"
         checkpoints.write(path, {k: v for k, v in agent.items() if k != "teacher"})
@@ -154,13 +158,30 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
     return f"{path}: inputs {', '.join(inputs)}"
 
 
+def fresh_optimizer(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the state of an agent's optimiser before its first step, by its run's settings.
+
+    Raises:
+        ValueError: if this version cannot read the settings, or the weights do not match them.
+    """
+    agent = checkpoints.agent_of(checkpoint, name)
+    settings = runner_settings(from_dict(checkpoint["config"]), {}, {})["agents"]
+    actor = load_actor(agent, name, "cpu")
+    critic = load_critic(checkpoint, name, "cpu", actor)
+    algorithm = checkpoints.agent_of({"agents": settings}, name)["algorithm"]
+    optimizer: torch.optim.Optimizer = resolve_optimizer(algorithm["optimizer"])(
+        chain(actor.parameters(), critic.parameters()), lr=algorithm["learning_rate"]
+    )
+    return optimizer.state_dict()
+
+
 def run(source: str, folder: Path | None, form: str, console: Console) -> None:
     """Write every agent of a checkpoint, and its critic of afterstates.
 
     Args:
         source: a published model's name, or the path of a checkpoint or a run's folder.
         folder: to write to; by default the checkpoint's, or ``./NAME`` for a published model.
-        form: ``onnx`` or ``rsl_rl``.
+        form: ``onnx``, ``rsl_rl`` or ``checkpoint``.
         console: says what was written.
 
     Raises:
@@ -170,7 +191,17 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
     checkpoint = checkpoints.read(path)
     folder = folder or (path.parent if published.is_path(source) else Path(source))
     folder.mkdir(parents=True, exist_ok=True)
+    if form == "checkpoint":
+        path = folder / PUBLISHED
+        slim = checkpoints.without_training(checkpoint) | {"marl_pack": __version__}
+        checkpoints.write(path, slim)
+        console.print(f"{path}: a checkpoint to publish, {path.stat().st_size:,} bytes")
+        return
     for name, agent in checkpoint["agents"].items():
+        learned = "critic_state_dict" in agent
+        if form == "rsl_rl" and learned and "optimizer_state_dict" not in agent:
+            state = fresh_optimizer(checkpoint, name)
+            agent = {**agent, "optimizer_state_dict": state}
         console.print(export_agent(agent, name, folder, form), soft_wrap=True)
         own = load_afterstate_critic(agent, "cpu")
         if own is not None and form == "onnx":  # a frozen agent's, of another run
@@ -187,8 +218,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = Parser(prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0])
     options.add_argument("checkpoint", help="a published model, a checkpoint or a run's folder")
     options.add_argument(
-        "--format", choices=["onnx", "rsl_rl"], default="onnx",
-        help="ONNX (default), or the state that a stock rsl_rl PPO loads",
+        "--format", choices=["onnx", "rsl_rl", "checkpoint"], default="onnx",
+        help="ONNX (default), the state that a stock rsl_rl PPO loads, or a checkpoint to publish: "
+        "without what only the rest of its run needs",
     )  # fmt: skip
     options.add_argument(
         "--folder", type=Path,

@@ -5,16 +5,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_runs import same
 
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader, load_actor, load_afterstate_critic, record_of
 from marl_pack.agents.policy import InTurns
 from marl_pack.agents.search import SearchSettings
+from marl_pack.config import from_dict
 from marl_pack.evaluate import main as evaluate
+from marl_pack.export import main as export
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
 from marl_pack.players import with_search
 from marl_pack.train import main as train
+from marl_pack.training.assembly import make_runner
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +43,28 @@ def test_a_policy_is_rebuilt_from_its_file_on_any_bin(runs: Path, symmetric: boo
         game = Packing(16, (12, 9, 11), auto_reset=False)
         for _ in range(5):
             game.place(*policy(game))  # raises if a choice is not legal
+
+
+@pytest.mark.parametrize("name", ["both", "joint", "frozen"])
+def test_a_published_checkpoint_plays_and_begins_runs_as_before(
+    name: str, runs: Path, tmp_path: Path
+) -> None:
+    assert export([str(runs / name), "--format", "checkpoint", "--folder", str(tmp_path)]) == 0
+    path, game = tmp_path / "published.pt", Packing(16)
+    before, after = Loader().policy(runs / name), Loader().policy(path)
+    for _ in range(5):
+        choice = before(game)
+        assert all(map(torch.equal, choice, after(game)))
+        game.place(*choice)
+    whole, slim = checkpoints.read(runs / name), checkpoints.read(path)
+    assert not {"state", "schedule_iteration", "evaluations"} & slim.keys()
+    for agent in slim["agents"].values():
+        assert not {"optimizer_state_dict", "teacher"} & agent.keys()
+    config = from_dict(whole["config"])
+    config.init = str(path)
+    runner = make_runner(config, None)
+    for kind, ppo in runner.alg.learners.items():
+        assert same(ppo.critic.state_dict(), whole["agents"][kind]["critic_state_dict"])
 
 
 def test_agents_of_different_sources_play_together(runs: Path) -> None:

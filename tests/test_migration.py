@@ -10,6 +10,7 @@ from small_runs import same
 from torch import Tensor
 
 from marl_pack import config as configs
+from marl_pack import published
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.planes import PLANES
@@ -18,16 +19,16 @@ from marl_pack.game.packing import Packing
 from marl_pack.train import main as train
 from marl_pack.training.assembly import make_runner
 
-MODELS = sorted((Path(__file__).parent.parent / "models").glob("*.pt"))
-ORIGINALS = [path for path in MODELS if torch.load(path, weights_only=True)["format"] == 1]
+ORIGINAL = Path(__file__).parent / "data" / "format_1.pt"
+"""What the last version with format 1 wrote, of small networks after one iteration."""
 
 
-# --- the models -----------------------------------------------------------------------------------
+# --- a file that an earlier version wrote ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", ORIGINALS, ids=lambda path: path.stem)
-def test_a_model_of_format_1_is_read_as_format_2(path: Path) -> None:
-    original, checkpoint = torch.load(path, weights_only=True), checkpoints.read(path)
+def test_a_checkpoint_of_format_1_is_read_as_format_2() -> None:
+    original, checkpoint = torch.load(ORIGINAL, weights_only=True), checkpoints.read(ORIGINAL)
+    assert original["format"] == 1
     assert checkpoint["format"] == 2
     assert not {"afterstates", "state"} & checkpoint.keys()
     assert checkpoint["afterstate_optimizer"].keys() == {"state", "param_groups"}
@@ -46,9 +47,9 @@ def test_a_model_of_format_1_is_read_as_format_2(path: Path) -> None:
         assert planes == getattr(settings, name).network.planes
 
 
-@pytest.mark.parametrize("path", ORIGINALS[:1], ids=lambda path: path.stem)
-def test_the_export_of_a_migrated_model_loads_into_a_stock_ppo(path: Path, tmp_path: Path) -> None:
-    """The optimiser's parameters are numbered without those of the removed critic."""
+@pytest.mark.parametrize("path", [ORIGINAL, published.model("rs")], ids=lambda path: path.stem)
+def test_the_export_of_a_checkpoint_loads_into_a_stock_ppo(path: Path, tmp_path: Path) -> None:
+    """A published model gets a fresh optimiser; that of format 1 had the critic's parameters."""
     assert export([str(path), "--format", "rsl_rl", "--folder", str(tmp_path)]) == 0
     settings = configs.from_dict(checkpoints.read(path)["config"])
     settings.init = str(path)
@@ -67,7 +68,8 @@ def test_the_export_of_a_migrated_model_loads_into_a_stock_ppo(path: Path, tmp_p
         parameters = [*stock.actor.parameters(), *stock.critic.parameters()]
         (group,) = stock.optimizer.param_groups
         assert len(group["params"]) == len(parameters)
-        for parameter in parameters:
+        assert group["lr"] == state["optimizer_state_dict"]["param_groups"][0]["lr"] > 0
+        for parameter in parameters if path == ORIGINAL else ():
             assert stock.optimizer.state[parameter]["exp_avg"].shape == parameter.shape
     critic = checkpoints.read(path)["afterstate_critic"]
     assert same(runner.alg.lookahead.critic.state_dict(), critic)

@@ -68,6 +68,16 @@ def test_a_model_comes_with_its_settings_and_its_learning_curve(path: Path) -> N
     assert f"## {path.stem}\n" in (path.parent / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
+def test_a_model_holds_only_what_others_need_of_it(path: Path) -> None:
+    content = torch.load(path, weights_only=True)
+    published = checkpoints.without_training(content)
+    assert content["format"] == checkpoints.FORMAT
+    assert content.keys() == published.keys()
+    for name, agent in content["agents"].items():
+        assert agent.keys() == published["agents"][name].keys()
+
+
 def test_play_shows_a_model_in_the_game_it_was_trained_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

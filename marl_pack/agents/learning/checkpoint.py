@@ -16,6 +16,8 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
   its evaluations;
 - ``state``: in a run's latest checkpoint only, what resuming needs.
 
+A published checkpoint has only the parts that :func:`without_training` keeps.
+
 Files of format 1 are migrated (:mod:`marl_pack.agents.learning.migration`).
 """
 
@@ -195,6 +197,20 @@ def _check_player(record: Mapping[str, Any], agent: str, where: str) -> None:
     for part in ("network", "actor_state_dict"):
         if part not in record:
             raise ValueError(f"{where}.{part} is missing")
+
+
+def without_training(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint without what only the rest of its run needs, to be published.
+
+    It plays, searches, is exported and begins other runs (``--init``) as before.
+    """
+    own = ("format", "marl_pack", "config", "afterstate_critic", "iter", "items", "seconds")
+    parts = ("name", "network", "actor_state_dict", "critic_state_dict", "afterstate_critic")
+    agents = {
+        name: {part: agent[part] for part in parts if part in agent}
+        for name, agent in checkpoint["agents"].items()
+    }
+    return {part: checkpoint[part] for part in own if part in checkpoint} | {"agents": agents}
 
 
 def agent_of(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
