@@ -3,11 +3,13 @@
 ``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
 the checkpoint, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates. Batch and
 bin size are free. The masks are inputs and are applied inside: an illegal action has probability 0
-and is never the best.
+and is never the best. Each file's metadata says what its inputs are and what it was trained on
+(``docs/onnx.md``).
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 import warnings
@@ -26,19 +28,44 @@ from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning import checkpoint as checkpoints
-from marl_pack.agents.loading import load_actor, load_afterstate_critic, load_critic
+from marl_pack.agents.loading import (
+    load_actor,
+    load_afterstate_critic,
+    load_critic,
+    trained_game,
+)
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES, Meaning
 from marl_pack.config import from_dict
 from marl_pack.extras import missing
 from marl_pack.files import write_atomically
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.terminal import Parser, make_console
 from marl_pack.training.assembly import runner_settings
 
 OPSET = 18
 PUBLISHED = "published.pt"
 """The file of a checkpoint to publish."""
+
+OUTPUTS = {
+    "action": Meaning(
+        "number of an action",
+        "the most probable legal action: an orientation 0 … 5, or the cell x · D + y of the item's "
+        "low corner (of a joint agent o · W · D + x · D + y)",
+    ),
+    "probabilities": Meaning("0 to 1", "probability of each action; 0 where it is not legal"),
+}
+"""What the outputs of an agent's file mean, by name."""
+
+FEATURES_OF_AFTERSTATES = Meaning(
+    "described in marl_pack.agents.afterstates.features",
+    "features of the bin that each of K placements would leave",
+)
+VALUE_OF_AFTERSTATES = Meaning(
+    "reward", "the return still to come after each placement, its own reward not counted"
+)
 
 
 class Exported(nn.Module):
@@ -78,13 +105,42 @@ def example(agent: str, planes: Sequence[str]) -> dict[str, Tensor]:
     }
 
 
-def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
+def input_meanings(planes: Sequence[str]) -> dict[str, Meaning]:
+    """Return what the inputs of an agent's file mean, by name, in their order."""
+    meanings = dict(ALWAYS_OBSERVED)
+    for plane in planes:
+        meanings |= PLANES[plane].tensors
+    return meanings
+
+
+def training_facts(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the metadata of a checkpoint's files say of its training.
+
+    ``game`` holds the options of :class:`marl_pack.game.spec.GameSpec` with ``items`` and
+    ``sides``, ``trained_items`` the number of items seen, ``seed`` the run's.
+    """
+    return {
+        "game": trained_game(checkpoint),
+        "trained_items": checkpoint["items"],
+        "seed": checkpoint["config"].get("seed"),
+    }
+
+
+def export_onnx(
+    actor: Actor, agent: str, path: Path, training: Mapping[str, Any] | None = None
+) -> list[str]:
     """Write one agent as ONNX.
 
     Inputs are the tensors of the agent's observation
     (:func:`marl_pack.agents.networks.kinds.observe`), whole numbers as int64: ``heightmap``
     [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and those of the planes
     that its network sees. Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
+
+    Args:
+        actor: the agent's network.
+        agent: its name.
+        path: of the file.
+        training: facts for the file's metadata (:func:`training_facts`).
 
     Returns:
         The names of the inputs.
@@ -109,11 +165,20 @@ def export_onnx(actor: Actor, agent: str, path: Path) -> list[str]:
             opset_version=OPSET, input_names=names, output_names=["action", "probabilities"],
             verbose=False, dynamic_shapes=(tuple(shapes[name] for name in names),),
         )  # fmt: skip
-    _write(program, path)
+    described = {
+        "agent": agent,
+        "planes": list(actor.cnns.planes),
+        "inputs": _as_json(input_meanings(actor.cnns.planes)),
+        "outputs": _as_json(OUTPUTS),
+        "orientations": ORIENTATIONS,
+    }
+    _write(program, path, described | dict(training or {}))
     return names
 
 
-def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
+def export_afterstates(
+    critic: AfterstateCritic, path: Path, training: Mapping[str, Any] | None = None
+) -> None:
     """Write the critic of afterstates as ONNX: ``features`` [K, F] → ``value`` [K], both float32.
 
     The value of a placement is its reward plus the critic's value of its afterstate's features
@@ -126,16 +191,34 @@ def export_afterstates(critic: AfterstateCritic, path: Path) -> None:
             input_names=["features"], output_names=["value"], verbose=False,
             dynamic_shapes=({0: torch.export.Dim("placements", min=1)},),
         )  # fmt: skip
-    _write(program, path)
+    described = {
+        "agent": "afterstate_critic",
+        "inputs": _as_json({"features": FEATURES_OF_AFTERSTATES}),
+        "outputs": _as_json({"value": VALUE_OF_AFTERSTATES}),
+    }
+    _write(program, path, described | dict(training or {}))
 
 
-def _write(program: torch.onnx.ONNXProgram | None, path: Path) -> None:
+def _as_json(meanings: Mapping[str, Meaning]) -> dict[str, dict[str, str]]:
+    return {name: {"unit": m.unit, "meaning": m.text} for name, m in meanings.items()}
+
+
+def _write(program: torch.onnx.ONNXProgram | None, path: Path, metadata: Mapping[str, Any]) -> None:
+    """Write an ONNX file whose metadata are JSON texts."""
     assert program is not None
-    content = program.model_proto.SerializeToString()
-    write_atomically(path, lambda file: file.write(content))
+    model = program.model_proto
+    for key, value in {**metadata, "marl_pack": __version__}.items():
+        model.metadata_props.add(key=key, value=json.dumps(value))
+    write_atomically(path, lambda file: file.write(model.SerializeToString()))
 
 
-def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -> str:
+def export_agent(
+    agent: Mapping[str, Any],
+    name: str,
+    folder: Path,
+    form: str,
+    training: Mapping[str, Any] | None = None,
+) -> str:
     """Write one agent of a checkpoint; return a line that reports it.
 
     Args:
@@ -143,6 +226,7 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
         name: of the agent.
         folder: to write to.
         form: ``onnx`` or ``rsl_rl``.
+        training: facts for the metadata of an ONNX file (:func:`training_facts`).
     """
     if "network" not in agent:
         return f"{name}: played by {agent['name']}, no network to export"
@@ -154,7 +238,7 @@ def export_agent(agent: Mapping[str, Any], name: str, folder: Path, form: str) -
         checkpoints.write(path, {k: v for k, v in agent.items() if k != "teacher"})
         return f"{path}: for rsl_rl's PPO.load"
     path = folder / f"{name}.onnx"
-    inputs = export_onnx(load_actor(agent, name, "cpu"), name, path)
+    inputs = export_onnx(load_actor(agent, name, "cpu"), name, path, training)
     return f"{path}: inputs {', '.join(inputs)}"
 
 
@@ -197,19 +281,20 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
         checkpoints.write(path, slim)
         console.print(f"{path}: a checkpoint to publish, {path.stat().st_size:,} bytes")
         return
+    training = training_facts(checkpoint)
     for name, agent in checkpoint["agents"].items():
         learned = "critic_state_dict" in agent
         if form == "rsl_rl" and learned and "optimizer_state_dict" not in agent:
             state = fresh_optimizer(checkpoint, name)
             agent = {**agent, "optimizer_state_dict": state}
-        console.print(export_agent(agent, name, folder, form), soft_wrap=True)
+        console.print(export_agent(agent, name, folder, form, training), soft_wrap=True)
         own = load_afterstate_critic(agent, "cpu")
         if own is not None and form == "onnx":  # a frozen agent's, of another run
-            export_afterstates(own, folder / f"{name}_afterstate_critic.onnx")
+            export_afterstates(own, folder / f"{name}_afterstate_critic.onnx", training)
     critic = load_afterstate_critic(checkpoint, "cpu")
     if critic is not None and form == "onnx":
         path = folder / "afterstate_critic.onnx"
-        export_afterstates(critic, path)
+        export_afterstates(critic, path, training)
         console.print(f"{path}: features of an afterstate to its value", soft_wrap=True)
 
 

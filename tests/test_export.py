@@ -1,5 +1,8 @@
-"""ONNX files compute what PyTorch computes, for any batch and bin size."""
+"""ONNX files compute what PyTorch computes, for any batch and bin size, and say what they are."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +14,17 @@ from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.actor_critic import Actor, make_actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.agents.networks.planes import PLANES
-from marl_pack.export import Exported, export_afterstates, export_onnx, main
+from marl_pack.export import Exported, example, export_afterstates, export_onnx, main
 from marl_pack.game.packing import Packing
+from marl_pack.game.spec import GameSpec
+from marl_pack.geometry import ORIENTATIONS
 from marl_pack.train import main as train
+
+SCRIPT = Path(__file__).parent.parent / "examples" / "drive_onnx.py"
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
@@ -138,3 +146,74 @@ def test_a_frozen_networks_own_critic_is_written_beside_the_runs(tmp_path: Path)
         session = onnxruntime.InferenceSession(str(tmp_path / "run" / f"{name}.onnx"))
         values.append(session.run(["value"], {"features": inputs})[0])
     assert not np.allclose(*values)
+
+
+def metadata(path: Path) -> dict[str, object]:
+    entries = onnxruntime.InferenceSession(str(path)).get_modelmeta().custom_metadata_map
+    return {key: json.loads(value) for key, value in entries.items()}
+
+
+PLAIN = ("mask", "resting_height", "waste")
+
+
+@pytest.fixture(scope="module")
+def plain_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short run of plain agents, exported."""
+    folder = tmp_path_factory.mktemp("runs")
+    networks = [
+        f"--{agent}.network.{option}"
+        for agent in ("orientation", "placement")
+        for option in (f"planes=[{','.join(PLAIN)}]", "channels=8", "layers=2")
+    ]
+    options = [f"--output.folder={folder}", "--output.name=plain", "--seed=5"]
+    assert train([*SMALL, *options, *networks]) == 0
+    assert main([str(folder / "plain")]) == 0
+    return folder / "plain"
+
+
+def test_a_files_metadata_say_what_its_inputs_are_and_what_it_was_trained_on(
+    plain_run: Path,
+) -> None:
+    for agent in ("orientation", "placement"):
+        facts = metadata(plain_run / f"{agent}.onnx")
+        assert (facts["agent"], facts["planes"]) == (agent, list(PLAIN))
+        assert facts["inputs"].keys() == example(agent, PLAIN).keys()
+        assert facts["inputs"]["resting_height"]["unit"] == "cells"
+        assert facts["outputs"].keys() == {"action", "probabilities"}
+        assert facts["orientations"] == [list(row) for row in ORIENTATIONS]
+        assert GameSpec.of(facts["game"]) == GameSpec()
+        assert (facts["game"]["items"], facts["game"]["sides"]) == ("rs", [2, 5])
+        assert (facts["trained_items"], facts["seed"]) == (8, 5)
+
+
+def test_a_plane_says_what_each_of_its_tensors_means() -> None:
+    for name, plane in PLANES.items():
+        assert example("joint", [name]).keys() - example("joint", ()).keys() == plane.tensors.keys()
+
+
+def test_thirty_lines_without_marl_pack_play_as_the_package_does(plain_run: Path) -> None:
+    assert sum(bool(line) for line in SCRIPT.read_text("utf-8").splitlines()) <= 30
+    alone = (
+        "import runpy, sys; sys.modules |= {'marl_pack': None, 'torch': None}; "
+        "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0])"
+    )
+    policy = Loader().policy(str(plain_run))
+    for seed in range(3):
+        command = [sys.executable, "-c", alone, str(SCRIPT), str(plain_run), str(seed)]
+        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        rows = [line.split() for line in printed.splitlines()]
+        boxes = [[int(number) for number in row[:6]] for row in rows]
+
+        bin_ = np.zeros((10, 10, 10), int)
+        for x, y, z, w, d, h in boxes:
+            assert max(x + w, y + d, z + h) <= 10
+            bin_[x : x + w, y : y + d, z : z + h] += 1
+        assert bin_.max() == 1  # no two boxes overlap
+        assert rows[-1][-1] == f"{bin_.mean():.1%}"
+
+        items = np.random.default_rng(seed).integers(2, 6, (200, 3))
+        game = Packing(1, items=items, auto_reset=False)
+        while game.alive.any():
+            game.place(*policy(game))
+        assert game.bins.boxes[0, : len(boxes)].tolist() == boxes
+        assert int(game.bins.count) == len(boxes)

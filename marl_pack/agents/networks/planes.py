@@ -27,6 +27,19 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class Meaning:
+    """What the numbers of one tensor of an observation are.
+
+    Args:
+        unit: their unit, or the values that they may have.
+        text: what they say, and how they are computed.
+    """
+
+    unit: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Plane:
     """One plane that a network may see beside the paper's four channels.
 
@@ -34,6 +47,7 @@ class Plane:
         name: its name in settings.
         meaning: its meaning in a few words.
         observe: a turn → tensors of the observation, by name; planes may share a tensor.
+        tensors: what these tensors mean, by name.
         channels: number of input channels for A orientations.
         encode: the observation → input channels, float32 [G, …, W, D] each.
         needs_critic: whether a critic of afterstates has to be there.
@@ -42,6 +56,7 @@ class Plane:
     name: str
     meaning: str
     observe: Callable[[Sight], dict[str, Tensor]]
+    tensors: dict[str, Meaning]
     channels: Callable[[int], int]
     encode: Callable[[Observation], list[Tensor]]
     needs_critic: bool = False
@@ -95,6 +110,22 @@ def _encode_afterstate_value(observation: Observation) -> list[Tensor]:
     return [*near, _everywhere(best, _shape(observation))]
 
 
+ALWAYS_OBSERVED = {
+    "heightmap": Meaning("cells", "height of each column: the top of its highest box, else 0"),
+    "item": Meaning(
+        "cells",
+        "sides w, d, h of the item as it comes; for the placement agent its sides along x, y, z in "
+        "the chosen orientation",
+    ),
+    "height": Meaning("cells", "height H of the bin"),
+    "mask": Meaning(
+        "true or false",
+        "whether each action is legal: an orientation is where it has a legal cell; the others "
+        "have probability 0",
+    ),
+}
+"""What the tensors of every observation mean, by name."""
+
 PLANES: dict[str, Plane] = {
     plane.name: plane
     for plane in (
@@ -102,6 +133,13 @@ PLANES: dict[str, Plane] = {
             "mask",
             "the cells where the item may be placed",
             lambda sight: {"legal_cells": sight.mask},
+            {
+                "legal_cells": Meaning(
+                    "true or false",
+                    "whether the item may be placed with its low corner there: it is inside the "
+                    "bin and the stability rule of training says that it stands",
+                )
+            },
             lambda orientations: orientations,
             lambda observation: [observation["legal_cells"].float()],
         ),
@@ -109,6 +147,13 @@ PLANES: dict[str, Plane] = {
             "resting_height",
             "the item's resting height at every cell, as a share of H",
             lambda sight: {"resting_height": sight.windows[0]},
+            {
+                "resting_height": Meaning(
+                    "cells",
+                    "highest column of the item's w × d window from there on; H where the window "
+                    "is not inside the bin",
+                )
+            },
             lambda orientations: orientations,
             lambda observation: [observation["resting_height"].float() / _height(observation)],
         ),
@@ -116,6 +161,14 @@ PLANES: dict[str, Plane] = {
             "waste",
             "the cells that the item would enclose, as a share of its own volume",
             lambda sight: {"waste": sight.windows[1]},
+            {
+                "waste": Meaning(
+                    "cells",
+                    "empty cells that the item would enclose below it: the sum over its window of "
+                    "resting height - height of the column; 0 where the window is not inside the "
+                    "bin",
+                )
+            },
             lambda orientations: orientations,
             _encode_waste,
         ),
@@ -124,6 +177,16 @@ PLANES: dict[str, Plane] = {
             "the mean number of cells where the next item may be placed afterwards: 1 for the most "
             "of all placements, 0 for a fifth less or fewer; and that most itself",
             _observe_feasible_cells,
+            {
+                "feasible_cells": Meaning(
+                    "cells",
+                    "mean number of cells where a box that may come next could be placed after "
+                    "this placement, by hull_alpha; 0 where it is not legal",
+                ),
+                "most_feasible_cells": Meaning(
+                    "cells", "largest number of feasible cells of all placements, all orientations"
+                ),
+            },
             lambda orientations: orientations + 1,
             _encode_feasible_cells,
         ),
@@ -135,6 +198,13 @@ PLANES: dict[str, Plane] = {
                     sight.lookahead.feasible_probability(sight.game)
                 )
             },
+            {
+                "feasible_probability": Meaning(
+                    "0 to 1",
+                    "probability that the next item has a feasible cell after this placement, by "
+                    "hull_alpha; 0 where it is not legal",
+                )
+            },
             lambda orientations: orientations,
             lambda observation: [observation["feasible_probability"]],
         ),
@@ -144,6 +214,16 @@ PLANES: dict[str, Plane] = {
             "for the best, 0 for a twentieth of the bin less, or for a two-hundredth less; and the "
             "best itself",
             _observe_afterstate_value,
+            {
+                "afterstate_value": Meaning(
+                    "reward",
+                    "reward of this placement plus the value of its afterstate by "
+                    f"afterstate_critic.onnx; {ILLEGAL:.0f} where it is not legal",
+                ),
+                "best_afterstate_value": Meaning(
+                    "reward", "largest value of all placements; 0 if none is legal"
+                ),
+            },
             lambda orientations: 2 * orientations + 1,
             _encode_afterstate_value,
             needs_critic=True,
@@ -152,6 +232,11 @@ PLANES: dict[str, Plane] = {
             "grounded",
             "the columns that are filled down to the floor, which carry boxes under hull_alpha",
             lambda sight: {"grounded": sight.game.bins.empty_map == 0},
+            {
+                "grounded": Meaning(
+                    "true or false", "whether the column is filled from the floor to its top"
+                )
+            },
             lambda orientations: 1,
             lambda observation: [observation["grounded"].float()[:, None]],
         ),
@@ -159,6 +244,7 @@ PLANES: dict[str, Plane] = {
             "filled",
             "the filled share of the bin; if items are cut from the bin, the rest is to come",
             lambda sight: {"filled": sight.utilization[:, None].float()},
+            {"filled": Meaning("0 to 1", "filled share of the bin's volume")},
             lambda orientations: 1,
             lambda observation: [_everywhere(observation["filled"], _shape(observation))],
         ),
