@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results clean
+.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results pages clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -61,6 +61,9 @@ benchmark: $(STAMP)  ## measure every figure of docs/results.md on speed
 
 results: $(STAMP)  ## make docs/results.md of the figures in results/
 	$(BIN)/python -m experiments.page
+
+pages: $(STAMP)  ## write the parts of docs/ that the code determines
+	$(BIN)/python -m docs.pages
 
 clean:  ## forget compiled code and caches
 	find . -name __pycache__ -prune -exec rm -rf {} +
