@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import re
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
+from docstring_parser import parse
+
+from marl_pack import env_aec
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES
 from marl_pack.export import OUTPUTS, example
+from marl_pack.game.spec import GameSpec
 
 DOCS = Path(__file__).parent
 
@@ -45,13 +52,63 @@ def onnx_page(page: str) -> str:
     return between(between(page, "inputs", onnx_inputs()), "outputs", onnx_outputs())
 
 
+def arguments_of(function: Any) -> dict[str, str]:
+    """Return what a docstring says of each argument, in Markdown."""
+    sentences = {p.arg_name: p.description or "" for p in parse(function.__doc__ or "").params}
+    return {name: markdown(sentence) for name, sentence in sentences.items()}
+
+
+def markdown(text: str) -> str:
+    """Return a text of a docstring, in reStructuredText, as one line of Markdown."""
+    text = re.sub(r":\w+:`(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")
+    return " ".join(text.split())
+
+
+def environment_arguments() -> str:
+    """Return the tables of the environment's arguments and of the options of its game."""
+    defaults = {
+        name: parameter.default
+        for function in (env_aec.env, env_aec.raw_env)
+        for name, parameter in inspect.signature(function).parameters.items()
+    }
+    options = {option.name: option.metadata["sentence"] for option in fields(GameSpec)}
+    own = arguments_of(env_aec.raw_env) | arguments_of(env_aec.env)
+    rows = [("argument", "default", "")]
+    for name, sentence in own.items():
+        if name in defaults and name not in options:
+            rows.append((f"`{name}`", f"`{defaults[name]!r}`", sentence))
+    options_rows = [("option", "default", "")]
+    for option in fields(GameSpec):
+        if option.name in defaults:
+            sentence = options[option.name].replace("null", "None")
+            options_rows.append((f"`{option.name}`", f"`{option.default!r}`", sentence))
+    return f"{table(*rows)}\n\n{table(*options_rows)}"
+
+
+def environment_page(_: str) -> str:
+    """Return docs/environment.md: the docstring of the environment, and its arguments."""
+    text = re.sub(r"`docs/(\w+)\.md`", r"[\1](\1.md)", inspect.getdoc(env_aec) or "")
+    before, after = text.split("\n## Seeds and episodes\n")
+    return f"""# The environment
+
+<!-- Written by `make pages` from the docstring of marl_pack/env_aec.py and the options of
+marl_pack/game/spec.py: change it there. -->
+
+{before}
+{environment_arguments()}
+
+## Seeds and episodes
+{after}
+"""
+
+
 def between(page: str, name: str, text: str) -> str:
     """Return a page with other text between the two comments that name a part of it."""
     pattern = rf"(<!-- {name}: [^>]*-->\n).*(<!-- end of {name} -->)"
     return re.sub(pattern, lambda part: f"{part[1]}{text}\n{part[2]}", page, flags=re.DOTALL)
 
 
-PAGES = {"onnx.md": onnx_page}
+PAGES = {"environment.md": environment_page, "onnx.md": onnx_page}
 """Each page that the code determines, with the function that makes it from the one before."""
 
 

@@ -1,40 +1,144 @@
-"""Online 3D bin packing as a two-agent PettingZoo environment (AEC).
+"""The packing game as a two-agent PettingZoo environment (AEC).
 
-A conveyor shows one box at a time. ``orientation_0`` chooses how it lies, then ``placement_0``
-places it in the bin, for good. Both share the reward. Masks hold exactly the actions after which
-nothing falls (Zhou et al. 2024, Algorithms 1 and 2). This module is a view of one game of
-:class:`marl_pack.game.packing.Packing`; no rule of the game stands here.
+A conveyor shows one box at a time. `orientation_0` chooses how it lies, then `placement_0` places
+it in the bin, for good. Both share the reward. Masks allow exactly the actions after which the
+stack still stands (Zhou et al. 2024, Algorithms 1 and 2).
 
 | | |
 |---|---|
-| Import | ``from marl_pack import env_aec`` |
-| Registered as | ``marl_pack/Packing-v0`` (PettingZoo ≥ 1.27: ``pettingzoo.make("aec", …)``) |
-| Agents | ``["orientation_0", "placement_0"]``, in this order each cycle |
-| Parallel API | yes, turn by turn (:func:`parallel_env`) |
-| Action spaces | ``Discrete(6)`` and ``Discrete(W · D)`` |
-| Observation spaces | ``Dict`` of ``observation: Box(0, 1, (4, W, D), float32)`` and |
-| | ``action_mask: Box(0, 1, (n,), int8)`` with n = 6 and W · D |
-| State space | ``Box(0, 1, (5, W, D), float32)`` |
+| Import | `from marl_pack import env_aec` |
+| Registered as | `marl_pack/Packing-v0`, by `import marl_pack` (PettingZoo ≥ 1.27) |
+| Actions | discrete |
+| Parallel API | yes, turn by turn |
+| Manual control | no |
+| Agents | `["orientation_0", "placement_0"]`, in this order each cycle |
+| Number of agents | 2 |
+| Action spaces | `Discrete(6)` and `Discrete(W · D)` |
+| Observation spaces | `Dict` of `observation` and `action_mask` |
+| … `observation` | `Box(0, 1, (4, W, D), float32)` |
+| … `action_mask` | `Box(0, 1, (n,), int8)`, n = 6 and W · D |
+| State space | `Box(0, 1, (5, W, D), float32)` |
+| Reward | dense, shared |
+| Render modes | `rgb_array`, `human`, `ansi` |
 
-**Observation.** Four planes: the heightmap and the item's three sides, each plane of a side
-constant. All lengths are divided by the longest side of the bin. The orientation agent sees the
-item's own sides w, d, h; the placement agent sees them along x, y, z in the chosen orientation.
+```python
+from marl_pack import env_aec
 
-**Legal actions.** An agent's ``action_mask`` is 1 at its legal actions, and all 0 when it is not
-its turn. Orientation o is legal if some cell is; a cell ``x · D + y`` is the item's low corner.
-The six orientations are the rows of :data:`marl_pack.geometry.ORIENTATIONS`.
+env = env_aec.env(render_mode="ansi")
+env.reset(seed=42)
+for agent in env.agent_iter():
+    observation, reward, termination, truncation, info = env.last()
+    action = None  # for an agent that has ended
+    if not (termination or truncation):
+        action = env.action_space(agent).sample(observation["action_mask"])  # your policy
+    env.step(action)
+print(info["utilization"])
+env.close()
+```
 
-**Reward.** After each placement both agents get ``alpha · v_item - beta · v_waste``, as shares of
-the bin's volume (Eq. 5-7); after each orientation both get 0.
+## A cycle
 
-**End.** Both agents terminate together when the next item has no legal action, there is no next
-item, or the bin holds ``max_items`` boxes. They are truncated together after ``max_cycles`` items.
+An item w × d × h arrives. The orientation agent picks one of six orientations. The placement agent
+picks the cell of the item's low corner, `x · D + y`. The item comes to rest on the highest column
+of its footprint. Then the next item arrives.
 
-**Info.** For both agents ``utilization`` (share of the bin filled) and ``packed`` (boxes in it).
-``env.unwrapped.plan`` is the record of the boxes placed so far (:class:`marl_pack.plan.Plan`).
+| orientation | 0 | 1 | 2 | 3 | 4 | 5 |
+|---|---|---|---|---|---|---|
+| sides along x, y, z | w d h | d w h | w h d | h w d | d h w | h d w |
 
-Version history: v0, first release.
+`o // 2` says which side is vertical (h, d, w). `o ^ 1` is the same rotated by 90° about the
+vertical. So `orientations=(0, 1)` keeps all items upright and `(0,)` does not rotate them. An item
+may be restricted further (`docs/items.md`): the masks then exclude its other orientations.
+
+## Observation
+
+Four planes: the heightmap and the item's three sides, each plane of a side constant. All lengths
+are divided by the longest side of the bin. The orientation agent always sees the item's own sides
+w, d, h. The placement agent sees them along x, y, z in the chosen orientation.
+
+`observe` of either agent and `state` work at any time, after the end too. `state()` is the
+heightmap, the item as it lies, and a plane that is 0 in the orientation agent's turn and 1 in the
+placement agent's.
+
+## Legal actions
+
+`observation["action_mask"]` (or `info["action_mask"]`, with `mask_in="info"`) is 1 at the legal
+actions of the agent whose turn it is and 0 everywhere for the other.
+
+- A cell is legal if the item placed there is inside the bin and stands by the stability rule
+  (`docs/stability.md`).
+- An orientation is legal if it has a legal cell. So while an agent lives, its turn has at least one
+  legal action. (With `mask_orientations=False` every orientation is; choosing one without a legal
+  cell ends the episode, with nothing placed and no reward.)
+
+An illegal action ends the game, with a reward of -1 (`illegal_reward`) for its agent and 0 for the
+other, as PettingZoo's `TerminateIllegalWrapper` does it. With `illegal="repair"` the nearest legal
+action is played instead.
+
+## Reward
+
+After each placement, both agents get `alpha · w d h / (W D H) - beta · waste / (W D H)` (Eq. 5-7).
+`waste` is the empty space newly enclosed below the item. After an orientation the reward is 0.
+
+## End of an episode
+
+Both agents terminate in the same step: when the next item has no legal action, the stream has no
+next item, or the bin holds `max_items` boxes. They are truncated together after `max_cycles` items.
+
+## Arguments
+
+`env()` takes arguments of its own and the options of the game. `Packing`, settings files (`game:`)
+and the commands that play have the same options; the bin's size, `bin` there, is `bin_size` here.
+An impossible value is refused in one line that says what would be right, an unknown option with the
+nearest valid name.
+
+`env()` wraps in PettingZoo's order: `raw_env` → `TerminateIllegal` (unless repaired) →
+`AssertOutOfBounds` → `OrderEnforcing`. `raw_env()` takes all but `illegal_reward` and raises
+`ValueError` on an illegal action.
+
+## Seeds and episodes
+
+`reset(seed=s)` begins the item stream of seed s. `reset()` without a seed goes on to its next
+episode. Episode k of a seed is the same in every batch and on every device.
+`reset(options={"items": items})` plays that sequence once: an array [L, 3], or items with
+attributes. An episode whose first item has no legal action is skipped; `reset` raises if the items
+of its options begin so.
+
+## What was packed
+
+Every agent's `info` holds the numbers `utilization`, the share of the bin filled, and `packed`, the
+boxes in it. `env.unwrapped.plan` is the record of the boxes placed so far: ids, positions, sides as
+placed, orientations, weights. `plan.to_json(path)` and `plan.to_csv(path)` write it for other
+programs.
+
+A copy (`copy.copy`, `copy.deepcopy`) or a pickle of an environment continues exactly and shares
+nothing with the original. A window stays with its owner.
+
+## Parallel API
+
+`parallel_env()` plays one *turn* a step: the acting agent is in `infos[agent]["active_agent"]`, the
+other's action is ignored, and every mask is exact. `parallel_env(simultaneous=True)` plays one
+*item* a step: the placement agent has to choose before the orientation is known, so its mask is all
+0 and `illegal="repair"` is required. Prefer the default.
+
+## Limits
+
+| what | limit |
+|---|---|
+| bin | 32,767 × 32,767 × 16,383 cells |
+| seed | 0 … 2⁶³ - 1 |
+| `max_items` | 2³¹ - 1 |
+
+Whole numbers are whole numbers: 5.0, `True` and `"5"` are refused as an action, a seed or a number
+of items. What is beyond a limit is refused before anything has changed.
+
+## Version history
+
+- v0: first release (marl_pack 0.1.0)
 """
+
+# This module is a view of one game of marl_pack.game.packing.Packing; no rule of the game stands
+# here. The docstring above is the source of docs/environment.md: `make pages` writes it.
 
 from __future__ import annotations
 

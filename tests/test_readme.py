@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+DOCS = ("physics", "environment", "items", "stability")
+PAGES = ("README.md", *(f"docs/{page}.md" for page in DOCS))
 EXAMPLES = [
     code
-    for name in ("README.md", "docs/physics.md", "docs/environment.md")
-    for code in re.findall(r"```python\n(.*?)```", (ROOT / name).read_text("utf-8"), re.DOTALL)
+    for page in PAGES
+    for code in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
 ]
 
 
@@ -19,4 +21,4 @@ def test_an_example_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out.strip()
     promised = re.search(r"print\(.*\)  # ([^:\n]*)", code)
     assert printed == promised[1] if promised else printed
-    assert len(EXAMPLES) == 6
+    assert len(EXAMPLES) == 9
