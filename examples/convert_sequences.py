@@ -1,0 +1,83 @@
+"""Convert the sequences that Zhao et al. 2021 published to files that marl_pack reads.
+
+``python examples/convert_sequences.py dataset/rs.pt rs.npz``. Their files are lists of sequences,
+each a list of boxes [w, d, h] in cells, saved by ``torch.save``. A box as large as the bin at the
+end of a sequence is their mark of the end, and is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+SCALAR = np.int64(0).__reduce__()[0]
+NUMPY_NUMBERS = [  # which a file may hold in place of Python's; the name depends on NumPy's version
+    np.dtype, type(np.dtype(np.int64)),
+    (SCALAR, "numpy.core.multiarray.scalar"), (SCALAR, "numpy._core.multiarray.scalar"),
+]  # fmt: skip
+
+
+def read(path: Path, size: Sequence[int]) -> list[NDArray[np.int64]]:
+    """Return the boxes [L, 3] of each sequence in one of their files.
+
+    Args:
+        path: of the file.
+        size: W, D, H of the bin.
+
+    Raises:
+        ValueError: if the file holds something else, naming the sequence.
+    """
+    try:
+        with torch.serialization.safe_globals(NUMPY_NUMBERS):
+            content = torch.load(path, weights_only=True)
+    except OSError:
+        raise
+    except Exception:  # of many kinds, with texts of many lines
+        raise ValueError(f"{path}: needs a list of sequences, saved by torch.save") from None
+    sequences = []
+    for k, boxes in enumerate(content):
+        sides = np.asarray(boxes)
+        if sides.ndim != 2 or sides.shape[1] != 3 or sides.dtype.kind not in "iu":
+            raise ValueError(f"{path}: sequence {k} needs boxes of three whole sides")
+        while len(sides) and (sides[-1] == size).all():
+            sides = sides[:-1]
+        sequences.append(sides)
+    return sequences
+
+
+def write(sequences: Sequence[NDArray[np.int64]], size: Sequence[int], path: Path) -> None:
+    """Write sequences as ``items`` [S, L, 3], padded with zeros, ``lengths`` [S] and ``bin``."""
+    lengths = np.array([len(sides) for sides in sequences])
+    items = np.zeros((len(sequences), lengths.max(), 3), np.int16)
+    for row, sides in zip(items, sequences, strict=True):
+        row[: len(sides)] = sides
+    np.savez_compressed(path, items=items, lengths=lengths, bin=np.array(size))
+
+
+def main() -> int:
+    """Convert one file; return the exit status."""
+    options = argparse.ArgumentParser(description="Convert published sequences.")
+    options.add_argument("source", type=Path, help="their file, such as dataset/rs.pt")
+    options.add_argument("target", type=Path, help="the file to write, such as rs.npz")
+    options.add_argument(
+        "--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
+        help="the bin's sides in cells (default: 10 10 10)",
+    )  # fmt: skip
+    chosen = options.parse_args()
+    try:
+        sequences = read(chosen.source, chosen.bin)
+        write(sequences, chosen.bin, chosen.target)
+    except (OSError, ValueError) as error:
+        options.exit(2, f"{options.prog}: {error}\n")
+    print(f"{chosen.target}: {len(sequences):,} sequences, {sum(map(len, sequences)):,} boxes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
