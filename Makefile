@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results pages clean
+.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results docs pages clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -61,6 +61,10 @@ benchmark: $(STAMP)  ## measure every figure of docs/results.md on speed
 
 results: $(STAMP)  ## make docs/results.md of the figures in results/
 	$(BIN)/python -m experiments.page
+
+docs: $(STAMP)  ## the pages and the API reference as HTML
+	$(BIN)/sphinx-build -W -q -c docs . build/docs
+	@echo build/docs/docs/index.html
 
 pages: $(STAMP)  ## write the parts of docs/ that the code determines
 	$(BIN)/python -m docs.pages

@@ -15,7 +15,7 @@ ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
     (1, 2, 0),
     (2, 1, 0),
 )
-"""The six axis permutations of a box: row ``o`` names which of the item's own sides
+"""The six axis permutations of a box. Row ``o`` names which of the item's own sides
 (0 = w, 1 = d, 2 = h) lies along x, y and z. ``o // 2`` picks the side that stands upright
 (h, d, w), and ``o ^ 1`` is the same box rotated by 90° about the vertical. So 0 is the item as
 it comes, and {0, 1} are the two orientations that keep it upright."""

@@ -4,7 +4,7 @@ Nothing here is fast. The batched code is tested cell by cell against these func
 what a rule means. The arithmetic is exact: a float means the decimal that is written for it, so 0.1
 is one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the
 corners of the contact squares, and a centre of mass must lie strictly inside it.
-``docs/environment.md`` lists where this departs from the paper.
+``docs/reproduce.md`` lists where this departs from the paper.
 """
 
 from __future__ import annotations

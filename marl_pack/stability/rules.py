@@ -150,6 +150,7 @@ RULES: dict[str, Callable[..., Tensor]] = {
     "equilibrium": equilibrium,
     "none": none,
 }
+"""Every stability rule by its name."""
 
 
 def make_rule(name: str, **parameters: object) -> Rule:
