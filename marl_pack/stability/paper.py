@@ -49,7 +49,7 @@ def convex_hull_alpha(
         heightmap: B, the height of each column, whole numbers [W, D].
         empty_map: E, the empty cells below the top of each column, whole numbers [W, D].
         item: sides w, d, h of the object.
-        bin_height: H.
+        bin_height: height H of the bin.
         reading: what the points of the hull are.
 
     Returns:
