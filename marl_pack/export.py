@@ -208,7 +208,7 @@ def _write(program: torch.onnx.ONNXProgram | None, path: Path, metadata: Mapping
     assert program is not None
     model = program.model_proto
     for key, value in {**metadata, "marl_pack": __version__}.items():
-        model.metadata_props.add(key=key, value=json.dumps(value))
+        model.metadata_props.add(key=key, value=json.dumps(value, ensure_ascii=False))
     write_atomically(path, lambda file: file.write(model.SerializeToString()))
 
 
