@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds fuzz mutations trainers play train benchmark results docs pages clean
+.PHONY: help setup test check bounds fuzz mutations trainers play configs train benchmark results docs pages clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -44,11 +44,14 @@ trainers: $(STAMP)  ## every trainer of examples/ in its own environment, briefl
 play: $(STAMP)  ## one game by a heuristic, shown and drawn
 	$(BIN)/python -m marl_pack.play --policy dblf --seed 0 --picture play.png
 
+configs: $(STAMP)  ## write configs/default.yaml again from the settings' defaults
+	$(BIN)/python -m marl_pack.config > configs/default.yaml
+
 train: $(STAMP)  ## train for a few minutes, then compare with heuristics
 	@if [ -f runs/quick/latest.pt ]; then \
 	  $(BIN)/python -m marl_pack.train --resume runs/quick; \
 	else \
-	  $(BIN)/python -m marl_pack.train --config configs/quick.yaml --output.name quick; \
+	  $(BIN)/python -m marl_pack.train --config quick --output.name quick; \
 	fi
 	$(BIN)/python -m marl_pack.evaluate --policy runs/quick dblf random --items rs --seed 1
 

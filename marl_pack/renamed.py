@@ -1,9 +1,10 @@
-"""Old names and what they are called now, and the nearest valid name for messages."""
+"""Old names and what they are called now, removed settings, and the nearest valid name."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 PLANES = {
     "rest": "resting_height",
@@ -22,6 +23,26 @@ AGENT_KEYS = {"imitate": "teacher", "imitate_iterations": "teacher_iterations"}
 
 OPTIONS = {"size": "bin", "rule_parameters": "margin or thresholds"}
 """Keyword arguments that games took (:class:`marl_pack.game.spec.GameSpec`)."""
+
+
+class Removed(NamedTuple):
+    """A setting that was removed: the one value that still holds, and what that means."""
+
+    value: object
+    now: str
+
+
+REMOVED = {
+    "network.dilation": Removed(1, "every convolution sees the cells next to each cell"),
+    "network.share_trunk": Removed(True, "the critic always uses the features of its actor"),
+    "ppo.symmetry": Removed(False, "the samples of an update are never mirrored"),
+}
+"""Settings without a good effect (docs/results.md), by their section and name."""
+
+
+def removed(key: str) -> Removed | None:
+    """Return the record of the setting ``key``, with dots between sections; None if it is none."""
+    return REMOVED.get(".".join(key.split(".")[-2:]))
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:

@@ -1,7 +1,7 @@
 """Train the orientation and the placement agent.
 
-``python -m marl_pack.train --config configs/rs.yaml --seed 1`` makes a run's folder with the
-resolved settings, checkpoints, TensorBoard's logs and the history of evaluations.
+``python -m marl_pack.train --config default --seed 1`` makes a run's folder with the resolved
+settings, checkpoints, TensorBoard's logs and the history of evaluations.
 ``--resume runs/NAME`` continues it. ``--help`` lists every setting.
 """
 

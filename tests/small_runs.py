@@ -3,6 +3,7 @@
 import resource
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 from tensordict import TensorDict
@@ -11,7 +12,11 @@ from torch import Tensor
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.config import Config, parse
 
+PLAIN = f"--config={Path(__file__).parent.parent / 'configs' / 'plain.yaml'}"
+"""Settings whose agents see no afterstates, which take most of a small run's time."""
+
 TINY = (
+    PLAIN,
     "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=16", "--ppo.num_steps_per_env=4",
     "--ppo.num_mini_batches=2", "--evaluation.every=0", "--output.latest_every=1",
     "--orientation.network.channels=8", "--orientation.network.layers=2",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import in_play, mirrored, put_boxes
-from small_runs import same
+from small_runs import PLAIN, same
 from torch import Tensor
 
 from marl_pack.agents.afterstates import critic as critics
@@ -30,6 +30,7 @@ from marl_pack.game.packing import Packing
 from marl_pack.training.assembly import make_runner
 
 SMALL = (
+    PLAIN,
     "--game.bin=[5,5,5]", "--game.sides=[1,3]", "--ppo.num_envs=8", "--ppo.num_steps_per_env=4",
     "--ppo.num_mini_batches=2", "--evaluation.every=0",
 )  # fmt: skip

@@ -16,7 +16,7 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.search import SearchSettings
 from marl_pack.backend import Backend
-from marl_pack.config import ConfigError, parse
+from marl_pack.config import parse
 from marl_pack.evaluate import main as evaluate
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS
@@ -204,14 +204,13 @@ def test_a_file_with_attributes_is_evaluated_and_its_plans_are_saved(tmp_path: P
     assert json.loads(table.read_text())["policies"]["dblf"]["packed"] == 14
 
 
-def test_agents_learn_on_goods_that_stay_upright_and_symmetries_need_pairs(tmp_path: Path) -> None:
+def test_agents_learn_on_goods_that_stay_upright(tmp_path: Path) -> None:
     path = tmp_path / "goods.json"
     rows = {"bin": [6, 6, 6], "items": [[2, 3, 1], [3, 1, 2]] * 10, "upright": [True, False] * 10}
     path.write_text(json.dumps(rows))
     small = [f"--game.items={path}", "--game.bin=[6,6,6]", "--ppo.num_envs=8",
              "--ppo.num_steps_per_env=4", "--ppo.num_mini_batches=2", "--evaluation.every=0",
-             "--placement.network.planes=[mask,feasible_probability,afterstate_value]",
-             "--ppo.symmetry=true"]  # fmt: skip
+             "--placement.network.planes=[mask,feasible_probability,afterstate_value]"]  # fmt: skip
     runner = make_runner(parse(small)[0], None)
     runner.train(2)
     game = runner.env.game
@@ -224,10 +223,6 @@ def test_agents_learn_on_goods_that_stay_upright_and_symmetries_need_pairs(tmp_p
     again.load_state_dict(state)
     assert torch.equal(again.items.orientations, game.items.orientations)
     assert torch.equal(again.mask, game.mask)
-    rows["orientations"] = [[0], [0, 1]] * 10
-    path.write_text(json.dumps(rows))
-    with pytest.raises(ConfigError, match=r"ppo\.symmetry = true: game\.items has items"):
-        make_runner(parse(small)[0], None)
 
 
 def test_without_a_mask_of_orientations_an_item_still_bars_its_own() -> None:

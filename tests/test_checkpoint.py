@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import same
+from small_runs import PLAIN, same
 
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader, load_actor, load_afterstate_critic, record_of
@@ -25,9 +25,9 @@ from marl_pack.training.assembly import make_runner
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Short runs: both agents, the joint one, and one with a frozen agent."""
     folder = tmp_path_factory.mktemp("runs")
-    small = ["--ppo.num_envs=8", "--ppo.num_steps_per_env=4", "--ppo.num_mini_batches=2",
-             "--ppo.max_iterations=1", "--evaluation.episodes=4", f"--output.folder={folder}",
-             "--placement.network.planes=[mask,resting_height,waste]"]  # fmt: skip
+    small = [PLAIN, "--ppo.num_envs=8", "--ppo.num_steps_per_env=4", "--ppo.num_mini_batches=2",
+             "--ppo.max_iterations=1", "--evaluation.episodes=4",
+             f"--output.folder={folder}"]  # fmt: skip
     both = ["--output.name=both", "--orientation.network.planes=[resting_height]"]
     assert train([*small, *both]) == 0
     assert train([*small, "--output.name=joint", "--joint=true"]) == 0

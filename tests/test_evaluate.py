@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_runs import PLAIN
 
 from marl_pack import evaluate, train
 from marl_pack import play as play_command
@@ -240,7 +241,7 @@ def test_episodes_that_cannot_begin_are_reported(capsys: pytest.CaptureFixture[s
 def test_a_checkpoints_own_game_is_played_unless_options_change_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--ppo.max_iterations=1", "--ppo.num_envs=8", "--ppo.num_mini_batches=2",
+    options = [PLAIN, "--ppo.max_iterations=1", "--ppo.num_envs=8", "--ppo.num_mini_batches=2",
                "--game.bin=[6,6,7]", "--game.sides=[1,3]", "--game.rule=area_ratio",
                "--game.thresholds=code", "--game.orientations=[0,1]", "--evaluation.every=0",
                "--game.com_offset=[0.05,0,0]", "--output.name=run"]  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_runs import PLAIN
 
 from marl_pack import export
 from marl_pack.agents.afterstates.critic import AfterstateCritic
@@ -96,7 +97,7 @@ def test_an_exported_critic_of_afterstates_agrees_with_pytorch(tmp_path: Path) -
 
 
 SMALL = (
-    "--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
+    PLAIN, "--ppo.num_envs=4", "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=1",
     "--ppo.max_iterations=1", "--evaluation.every=0",
 )  # fmt: skip
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
-from small_runs import same
+from small_runs import PLAIN, same
 from torch import Tensor
 
 from marl_pack import config as configs
@@ -93,6 +93,7 @@ ACTOR = {"cnns.weight": torch.tensor([0.0]), "mlp.weight": torch.tensor([1.0])}
 NETWORK = {"channels": 4, "planes": ["mask", "rest", "room", "fits", "worth", "solid", "filled"]}
 NEW_PLANES = ["mask", "resting_height", "feasible_cells", "feasible_probability",
               "afterstate_value", "grounded", "filled"]  # fmt: skip
+NEW_NETWORK = {"channels": 4, "shortcut": False, "context": False, "planes": NEW_PLANES}
 
 
 def learner(**others: Any) -> dict[str, Any]:
@@ -114,13 +115,13 @@ def network_of(critic: dict[str, Tensor]) -> dict[str, Any]:
     return {"network": NETWORK, "actor_state_dict": ACTOR | inside(critic)}
 
 
-def read(folder: Path, agents: dict[str, Any], **config: Any) -> dict[str, Any]:
-    """Write a checkpoint of format 1 and read it."""
+def read(folder: Path, agents: dict[str, Any], number: int = 1, **config: Any) -> dict[str, Any]:
+    """Write a checkpoint of an earlier format and read it."""
     path = folder / "old.pt"
     checkpoint = {
-        "format": 1, "marl_pack": "0.9", "config": config, "agents": agents, "iter": 3, "items": 8,
-        "seconds": 1.0, "evaluations": [], "schedule_iteration": 4, "afterstates": {"state": {}},
-        "state": [{"game": {}}],
+        "format": number, "marl_pack": "0.9", "config": config, "agents": agents, "iter": 3,
+        "items": 8, "seconds": 1.0, "evaluations": [], "schedule_iteration": 4,
+        "afterstates": {"state": {}}, "state": [{"game": {}}],
     }  # fmt: skip
     torch.save(checkpoint, path)
     return checkpoints.read(path)
@@ -133,7 +134,7 @@ def test_a_learner_loses_its_copy_of_the_critic(tmp_path: Path) -> None:
     for agent in checkpoint["agents"].values():
         assert "afterstate_critic" not in agent
         assert same(agent["actor_state_dict"], ACTOR)
-        assert agent["network"] == {"channels": 4, "planes": NEW_PLANES}
+        assert agent["network"] == NEW_NETWORK
         optimizer = agent["optimizer_state_dict"]
         assert optimizer["param_groups"] == [{"lr": 0.1, "params": [0, 1, 2, 3]}]
         moments = {k: float(state["exp_avg"]) for k, state in optimizer["state"].items()}
@@ -179,7 +180,7 @@ def test_heuristics_and_settings_get_their_new_names(tmp_path: Path) -> None:
     assert checkpoint["agents"]["placement"] == {"name": "max_feasible"}
     assert checkpoint["config"] == {
         "orientation": {
-            "network": {"channels": 4, "planes": NEW_PLANES},
+            "network": NEW_NETWORK,
             "teacher": "max_feasible", "teacher_iterations": 5,
         },
         "placement": {"frozen": True, "policy": "max_feasible"},
@@ -193,10 +194,45 @@ def test_heuristics_and_settings_get_their_new_names(tmp_path: Path) -> None:
     assert game.moves.allows(orientation, agent(game, orientation)).all()
 
 
+REMOVED = {"dilation": 1, "share_trunk": True}
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_settings_that_were_removed_are_dropped(number: int, tmp_path: Path) -> None:
+    player = network_of(OWN) | {"network": NETWORK | REMOVED}
+    agents = {"orientation": player | {"teacher": player}, "placement": player}
+    settings = {"ppo": {"symmetry": False, "lam": 0.9}, "placement": {"network": REMOVED}}
+    checkpoint = read(tmp_path, agents, number, **settings)
+    assert not REMOVED.keys() & checkpoint["config"]["placement"]["network"].keys()
+    assert checkpoint["config"]["ppo"] == {"lam": 0.9}
+    orientation, placement = checkpoint["agents"].values()
+    for record in (orientation, orientation["teacher"], placement):
+        assert NETWORK.keys() <= record["network"].keys()
+        assert not REMOVED.keys() & record["network"].keys()
+
+
+@pytest.mark.parametrize(("where", "name", "value"), [
+    ("config.ppo", "symmetry", True), ("config.orientation.network", "dilation", 2),
+    ("agents.placement.network", "share_trunk", False),
+    ("agents.placement.teacher.network", "dilation", True),
+])  # fmt: skip
+def test_another_value_of_a_removed_setting_is_refused(
+    where: str, name: str, value: object, tmp_path: Path
+) -> None:
+    agents = {"placement": network_of(OWN) | {"teacher": network_of(OWN)}}
+    checkpoint = {"agents": agents, "ppo": {}, "orientation": {"network": {}}}
+    section: Any = checkpoint
+    for key in where.removeprefix("config.").split("."):
+        section[key] = section = dict(section[key])
+    section[name] = value
+    with pytest.raises(ValueError, match=rf"{where}\.{name} = {value}: was removed, and only "):
+        read(tmp_path, checkpoint.pop("agents"), 2, **checkpoint)
+
+
 def test_a_run_of_format_1_is_not_resumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ["--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=4",
+    small = [PLAIN, "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=4",
              "--ppo.num_steps_per_env=2", "--ppo.num_mini_batches=2", "--ppo.max_iterations=1",
              "--evaluation.every=0", "--output.name=run",
              f"--output.folder={tmp_path}"]  # fmt: skip

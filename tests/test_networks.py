@@ -15,7 +15,7 @@ from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, ma
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice, observe
 from marl_pack.agents.networks.planes import PLANES, channel_names, input_channels
 from marl_pack.agents.networks.shape import Network
-from marl_pack.agents.networks.symmetry import transform
+from marl_pack.agents.networks.symmetry import mirror_actions, mirror_observation
 from marl_pack.agents.networks.trunk import Trunk, widen
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS
@@ -85,10 +85,11 @@ def test_every_kind_of_agent_keeps_the_contract(agent: str) -> None:
     action = observation["mask"].int().argmax(1)
     for symmetry in range(4):
         bits = torch.full((6,), symmetry)
-        once = transform(observation, action[:, None], agent, bits)
-        assert once[0]["mask"].gather(1, once[1]).all(), "the moved action is legal"
-        twice, moved = transform(*once, agent, bits)
-        assert torch.equal(moved[:, 0], action)
+        once = mirror_observation(observation, agent, bits)
+        there = mirror_actions(action[:, None], observation["item"], (6, 5), agent, bits)
+        assert once["mask"].gather(1, there).all(), "the moved action is legal"
+        twice = mirror_observation(once, agent, bits)
+        assert torch.equal(mirror_actions(there, once["item"], (6, 5), agent, bits)[:, 0], action)
         assert observation.keys() == twice.keys()
         assert all(torch.equal(twice[name], observation[name]) for name in observation)
     choice = kind.extend(before, action, game.floor)
@@ -120,8 +121,7 @@ def test_every_plane_keeps_the_contract_alone(name: str, agent: str) -> None:
     assert channels.shape == (5, 4 + count, 6, 5)
     assert channels.dtype == torch.float32
     assert channels.isfinite().all()
-    action = observation["mask"].int().argmax(1, keepdim=True)
-    mirrored, _ = transform(observation, action, agent, torch.full((5,), 3))
+    mirrored = mirror_observation(observation, agent, torch.full((5,), 3))
     assert mirrored.keys() == observation.keys()
     assert input_channels(mirrored, [name]).shape == channels.shape
 
@@ -162,10 +162,9 @@ def test_grounded_are_the_columns_without_a_gap() -> None:
     assert torch.equal(input_channels(observation, ["grounded"])[0, 4], grounded[0].float())
 
 
-@pytest.mark.parametrize(("dilation", "reach"), [(1, 3), (2, 5)])
-def test_three_layers_reach_as_far_as_their_dilation_allows(dilation: int, reach: int) -> None:
+def test_three_layers_without_context_reach_three_cells_far() -> None:
     torch.manual_seed(0)
-    trunk = Trunk(1, Network(channels=4, planes=[], dilation=dilation))
+    trunk = Trunk(1, Network(channels=4, planes=[], shortcut=False, context=False))
     observation = {
         "heightmap": torch.zeros(1, 15, 15),
         "item": torch.ones(1, 3),
@@ -174,8 +173,8 @@ def test_three_layers_reach_as_far_as_their_dilation_allows(dilation: int, reach
     flat = trunk(observation).whole
     observation["heightmap"][0, 7, 7] = 5
     changed = (trunk(observation).whole != flat).any(1)[0].nonzero()
-    assert changed.min(0).values.tolist() == [7 - reach, 7 - reach]
-    assert changed.max(0).values.tolist() == [7 + reach, 7 + reach]
+    assert changed.min(0).values.tolist() == [4, 4]
+    assert changed.max(0).values.tolist() == [10, 10]
 
 
 def test_with_a_shortcut_the_heads_see_the_input_channels() -> None:
@@ -288,18 +287,15 @@ def test_an_observation_does_not_change_when_the_game_goes_on() -> None:
     assert all(torch.equal(observation[name], copies[name]) for name in copies)
 
 
-def actor_and_critic(share: bool) -> tuple[Actor, Critic]:
-    """Build the placement agent's networks, with one trunk or with two."""
+def actor_and_critic() -> tuple[Actor, Critic]:
+    """Build the placement agent's networks."""
     torch.manual_seed(0)
-    arguments = {"agent": "placement", "network": {**SMALL, "share_trunk": share}}
-    groups = {"actor": [], "critic": []}
-    actor = Actor({}, groups, "actor", 1, **arguments)
-    cnns = {"cnns": actor.cnns} if share else {}
-    return actor, Critic({}, groups, "critic", 1, **arguments, **cnns)
+    actor = make_actor("placement", SMALL, "cpu")
+    return actor, make_critic("placement", SMALL, "cpu", actor)
 
 
 def test_a_critic_that_shares_the_trunk_sees_the_current_features() -> None:
-    actor, critic = actor_and_critic(share=True)
+    actor, critic = actor_and_critic()
     first = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
     other = dict(first, item=first["item"] + 1)
     actor(first)
@@ -316,15 +312,14 @@ def test_a_critic_that_shares_the_trunk_sees_the_current_features() -> None:
 
 
 def test_a_shared_trunk_is_the_actors_alone_in_parameters_and_state() -> None:
-    for share in (True, False):
-        actor, critic = actor_and_critic(share)
-        own = {id(p) for p in actor.parameters()}
-        assert not own & {id(p) for p in critic.parameters()}
-        assert any(name.startswith("cnns.") for name in critic.state_dict()) != share
+    actor, critic = actor_and_critic()
+    own = {id(p) for p in actor.parameters()}
+    assert not own & {id(p) for p in critic.parameters()}
+    assert not any(name.startswith("cnns.") for name in critic.state_dict())
 
 
 def test_a_critic_trains_the_shared_trunk() -> None:
-    actor, critic = actor_and_critic(share=True)
+    actor, critic = actor_and_critic()
     observation = observed("placement", Packing(4, (6, 6, 6), sides=(2, 3)), ())
     actor(observation, stochastic_output=True)
     critic(observation).sum().backward()
@@ -350,9 +345,8 @@ def test_a_plane_by_its_old_name_is_refused_with_the_new_one(old: str, new: str)
 
 @pytest.mark.parametrize("agent", AGENT_KINDS)
 @pytest.mark.parametrize("shortcut", [False, True])
-@pytest.mark.parametrize("share", [False, True])
-def test_a_widened_network_computes_the_same(agent: str, shortcut: bool, share: bool) -> None:
-    shape = {**SMALL, "shortcut": shortcut, "context": True, "share_trunk": share}
+def test_a_widened_network_computes_the_same(agent: str, shortcut: bool) -> None:
+    shape = {**SMALL, "shortcut": shortcut, "context": True}
     narrow = shape | {"planes": ["waste", "feasible_cells"]}
     wide = shape | {"planes": ["filled", "feasible_cells", "mask", "waste"]}
     game = Packing(4, (6, 5, 7), sides=(2, 4))

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import RunInterruptedError
-from marl_pack.agents.learning.symmetry import mirror_rollout
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.kinds import observe
 from marl_pack.agents.policy import Policy
@@ -241,31 +240,6 @@ def test_a_run_with_a_frozen_network_resumes_without_the_old_file(tmp_path: Path
     assert same(resumed.checkpoint()["agents"]["placement"]["actor_state_dict"], stored)
 
 
-@pytest.mark.parametrize("joint", [False, True])
-def test_symmetry_begins_the_update_from_ratios_of_one(joint: bool) -> None:
-    """Otherwise the KL would be huge, and the adaptive learning rate would collapse."""
-    config = tiny("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--ppo.desired_kl=0.02",
-                  f"--joint={str(joint).lower()}")  # fmt: skip
-    runner = make_runner(config, None)
-    runner.train(3)
-    for name, ppo in runner.alg.learners.items():
-        assert ppo.learning_rate > 7e-4, name
-    rollout(runner)
-    for name, ppo in runner.alg.learners.items():
-        mirror_rollout(ppo, name)
-        storage = ppo.storage
-        for step in range(4):
-            ppo.actor(storage.observations[step], stochastic_output=True)
-            log_prob = ppo.actor.get_output_log_prob(storage.actions[step])
-            assert torch.allclose(log_prob, storage.actions_log_prob[step, :, 0], atol=1e-5)
-            assert (log_prob > -30).all(), "the moved action is legal in what is observed"
-            stored = [parameter[step] for parameter in storage.distribution_params]
-            for old, new in zip(stored, ppo.actor.output_distribution_params, strict=True):
-                assert torch.allclose(old, new, atol=1e-5)
-            values = ppo.critic(storage.observations[step])
-            assert torch.allclose(values, storage.values[step], atol=1e-5)
-
-
 def test_how_often_a_run_is_evaluated_does_not_change_its_weights(tmp_path: Path) -> None:
     results = []
     for every in (0, 1):
@@ -278,22 +252,12 @@ def test_how_often_a_run_is_evaluated_does_not_change_its_weights(tmp_path: Path
     assert same(*results)
 
 
-def test_a_critic_with_a_trunk_of_its_own_and_symmetry_learn_too() -> None:
-    config = tiny("--ppo.symmetry=true", "--placement.network.share_trunk=false",
-                  "--orientation.network.planes=[mask,resting_height,waste]")  # fmt: skip
-    runner = make_runner(config, None)
-    before = weights(runner, "placement")
-    runner.train(2)
-    after = weights(runner, "placement")
-    assert all(not torch.equal(before[n], after[n]) for n in before if n.endswith("weight"))
-
-
 # --- stopping and resuming -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [
     (), ("--joint=true",), ("--orientation.frozen=true", "--orientation.policy=random"),
-    ("--ppo.symmetry=true", "--ppo.schedule=adaptive", "--game.items=cut2"),
+    ("--ppo.schedule=adaptive", "--game.items=cut2"),
     ("--orientation.network.planes=[mask,afterstate_value]",
      "--placement.network.planes=[afterstate_value,feasible_cells]"),
     ("--orientation.teacher=random", "--orientation.teacher_iterations=4"),

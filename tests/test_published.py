@@ -41,7 +41,7 @@ def test_names_work_in_any_folder(
     assert evaluate(["--orientation", "first", "--placement", "cut_1", "--episodes", "2"]) == 0
     assert "cut_1: trained on cut1" in capsys.readouterr().out
     assert parse(["--config", "quick"])[0] == parse([f"--config={ROOT}/configs/quick.yaml"])[0]
-    assert parse(["--config=quick", "--config=ablations/joint"])[0].joint
+    assert parse(["--config=quick", "--config=ablations/hull_1"])[0].game.rule == "hull_1"
     assert export(["rs", "--format", "rsl_rl"]) == 0  # beside nothing in the installed package
     assert (tmp_path / "rs" / "placement.pt").is_file()
 

@@ -1,4 +1,4 @@
-"""Augmentation by the bin's symmetries: mirrored play is play in the mirrored bin."""
+"""The bin's symmetries: mirrored play is play in the mirrored bin."""
 
 from dataclasses import replace
 
@@ -19,7 +19,6 @@ from marl_pack.agents.networks.symmetry import (
     mean_probabilities,
     mirror_actions,
     mirror_observation,
-    transform,
 )
 from marl_pack.game.packing import Packing
 
@@ -64,7 +63,8 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
     kind, action = AGENT_KINDS[agent], orientation
     if kind.acts_on_cells:
         action = cell if kind.orientations == 1 else game.floor.pair(orientation, cell)
-    transformed, moved = transform(observation, action[:, None].float(), agent, symmetries)
+    transformed = mirror_observation(observation, agent, symmetries)
+    moved = mirror_actions(action[:, None], observation["item"], SIZE[:2], agent, symmetries)
     assert transformed.keys() == expected.keys()
     for name, values in expected.items():
         if name.endswith("afterstate_value"):  # sums in another order
@@ -72,10 +72,10 @@ def test_a_transformed_observation_is_that_of_the_mirrored_bin(agent: str, symme
         else:
             assert torch.equal(transformed[name], values), name
     if not kind.acts_on_cells:
-        assert torch.equal(moved.squeeze(1).long(), rotated)
+        assert torch.equal(moved.squeeze(1), rotated)
         return
     # The box placed by the new action stands where the mirrored box would.
-    new_cell = moved.squeeze(1).long() % game.floor.cells
+    new_cell = moved.squeeze(1) % game.floor.cells
     before, after = game.bins.heightmap.clone(), other.bins.heightmap.clone()
     game.place(orientation, cell)
     other.place(rotated, new_cell)
@@ -92,9 +92,9 @@ def test_a_square_bin_has_eight_symmetries_and_another_one_four() -> None:
 def test_a_bin_that_is_not_square_is_mirrored() -> None:
     game = played((7, 5, 8))
     observation = observed("orientation", game, torch.zeros(game.n, dtype=torch.int64))
-    action, symmetry = torch.zeros(game.n, 1), torch.full((game.n,), 3)
-    once = transform(observation, action, "orientation", symmetry)
-    twice, _ = transform(*once, "orientation", symmetry)
+    symmetry = torch.full((game.n,), 3)
+    once = mirror_observation(observation, "orientation", symmetry)
+    twice = mirror_observation(once, "orientation", symmetry)
     assert all(torch.equal(twice[name], observation[name]) for name in observation)
 
 

@@ -235,7 +235,7 @@ def load_critic(
     Args:
         checkpoint: of the run.
         kind, device: as for :func:`load_actor`.
-        actor: the agent's, whose trunk the critic may share.
+        actor: the agent's, whose trunk the critic shares.
 
     Raises:
         ValueError: if the agent has no critic, or its weights do not match its network.

@@ -94,11 +94,6 @@ def check_ppo(config: Config) -> None:
             "ppo.num_mini_batches", ppo.num_mini_batches,
             f"each needs 2 items, an iteration has only {ppo.num_envs * ppo.num_steps_per_env}",
         )  # fmt: skip
-    if ppo.symmetry and any(config.game.com_offset):
-        refuse("ppo.symmetry", "true", "items whose centre of mass is off centre do not mirror")
-    orientations = set(config.game.orientations)
-    if ppo.symmetry and {o ^ 1 for o in orientations} != orientations:
-        refuse("ppo.symmetry", "true", "game.orientations needs the pairs 0 1, 2 3 and 4 5 whole")
 
 
 def check_output(config: Config) -> None:

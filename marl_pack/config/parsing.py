@@ -163,7 +163,7 @@ def check_source(source: str, option: str) -> None:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(root, yaml.MappingNode):
-        raise ConfigError(f"{path}: needs keys and values, as configs/rs.yaml has them")
+        raise ConfigError(f"{path}: needs keys and values, as configs/default.yaml has them")
     own = sections()
 
     def check_section(node: yaml.MappingNode, prefix: str) -> None:
@@ -369,6 +369,8 @@ def explain(parser: ArgumentParser, message: str) -> str:
     section, _, last = key.rpartition(".")
     if last in renamed.AGENT_KEYS:
         return f"unknown key {key}: it is now called {section}.{renamed.AGENT_KEYS[last]}"
+    if removed := renamed.removed(key):
+        return f"{key} was removed: {removed.now}; leave it out"
     every_key = keys(parser)
     while section and not any(name.startswith(section + ".") for name in every_key):
         section = section.rpartition(".")[0]

@@ -1,7 +1,7 @@
 """The settings of a training run: typed, each with its meaning.
 
-The docstrings are what ``python -m marl_pack.train --help`` shows; ``configs/rs.yaml`` holds every
-key with its default.
+The docstrings are what ``python -m marl_pack.train --help`` shows; ``configs/default.yaml``
+holds every key with its default.
 """
 
 from __future__ import annotations
@@ -92,28 +92,26 @@ class PPO:
         normalize_advantage_per_mini_batch: normalise advantages in each minibatch, not over the
             iteration.
         optimizer: the optimiser, one of torch's.
-        symmetry: replace each sample of an update by its image under a random symmetry of the bin.
     """
 
-    num_envs: int = 256
+    num_envs: int = 64
     num_steps_per_env: int = 16
-    max_iterations: int = 300
+    max_iterations: int = 2500
     num_learning_epochs: int = 2
-    num_mini_batches: int = 32
+    num_mini_batches: int = 16
     gamma: float = 1.0
     lam: float = 0.96
     clip_param: float = 0.2
-    value_loss_coef: float = 0.5
+    value_loss_coef: float = 30.0
     use_clipped_value_loss: bool = False
-    entropy_coef: float = 0.005
-    final_entropy_coef: float | None = None
-    learning_rate: float = 7e-4
+    entropy_coef: float = 0.02
+    final_entropy_coef: float | None = 0.001
+    learning_rate: float = 1e-3
     schedule: Literal["fixed", "linear", "adaptive"] = "linear"
     desired_kl: float = 0.01
     max_grad_norm: float = 1.0
     normalize_advantage_per_mini_batch: bool = False
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
-    symmetry: bool = False
 
 
 @dataclass
@@ -126,7 +124,7 @@ class Evaluation:
         seed: seed of those sequences; training draws others.
     """
 
-    every: int = 20
+    every: int = 80
     episodes: int = 1000
     seed: int = 2024
 

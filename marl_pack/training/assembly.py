@@ -118,9 +118,8 @@ def runner_settings(
     """
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
-    symmetry, final_entropy = ppo.pop("symmetry"), ppo.pop("final_entropy_coef")
+    final_entropy, schedule = ppo.pop("final_entropy_coef"), ppo.pop("schedule")
     ppo.pop("num_envs")
-    schedule = ppo.pop("schedule")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
     def learner(name: str, own: Agent) -> dict[str, Any]:
@@ -130,7 +129,6 @@ def runner_settings(
         return {
             "network": asdict(own.network),
             "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
-            "symmetry": symmetry,
             "teacher": teachers.get(name),
             "teacher_iterations": own.teacher_iterations,
             "schedule": {
@@ -186,7 +184,6 @@ def make_runner(
             config, config.ppo.num_envs, derived_seed(config.seed, rank()), auto_reset=True,
             device=device,
         )  # fmt: skip
-        check_symmetry(config, game)
         planes = {
             name: agent["network"]["planes"] if "network" in agent else []
             for name, agent in settings["agents"].items()
@@ -216,20 +213,6 @@ def make_runner(
             raise
         raise ConfigError(f"too little memory for these settings: {error}") from None
     return runner
-
-
-def check_symmetry(config: Config, game: Packing) -> None:
-    """Refuse augmentation by symmetries if an item may take orientation o but not o ^ 1.
-
-    Raises:
-        ConfigError: naming the orientations of such items.
-    """
-    for orientations in game.orientation_sets if config.ppo.symmetry else ():
-        if {o ^ 1 for o in orientations} != set(orientations):
-            raise ConfigError(
-                f"ppo.symmetry = true: game.items has items with the orientations {orientations}; "
-                "each needs the pairs 0 1, 2 3 and 4 5 whole"
-            )
 
 
 def evaluation(config: Config, checkpoint: Mapping[str, Any]) -> dict[str, Any]:

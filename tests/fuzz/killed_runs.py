@@ -33,6 +33,7 @@ OPTIONS = (
     "--evaluation.episodes=4", "--output.latest_every=1", "--output.keep_every=3",
     "--orientation.network.channels=8", "--orientation.network.layers=2",
     "--placement.network.channels=8", "--placement.network.layers=2",
+    "--orientation.network.planes=[mask,resting_height,waste]",
     "--placement.network.planes=[mask,afterstate_value]",
 )  # fmt: skip
 

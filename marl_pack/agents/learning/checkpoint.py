@@ -18,7 +18,7 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
 
 A published checkpoint has only the parts that :func:`without_training` keeps.
 
-Files of format 1 are migrated (:mod:`marl_pack.agents.learning.migration`).
+Files of earlier versions are migrated (:mod:`marl_pack.agents.learning.migration`).
 """
 
 from __future__ import annotations
@@ -180,6 +180,7 @@ def _checked(content: Any, size: int) -> dict[str, Any]:
         raise ValueError(f"agents: {shown(unknown[0])} is none of {', '.join(AGENT_KINDS)}")
     if checkpoint["format"] == 1:
         checkpoint = migration.from_format_1(checkpoint)
+    checkpoint = migration.without_removed(checkpoint)
     for name, agent in checkpoint["agents"].items():
         _check_player(agent, name, f"agents.{name}")
         if "teacher" in agent:

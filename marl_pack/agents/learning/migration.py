@@ -1,7 +1,8 @@
-"""Migrate checkpoints of format 1 to format 2.
+"""Migrate checkpoints that earlier versions wrote.
 
 Format 1 had other names for planes, policies and settings, and kept the critic of afterstates once
-in each actor's weights. The games in play that it stored cannot be resumed.
+in each actor's weights. The games in play that it stored cannot be resumed. Both formats may hold
+settings that were removed since.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from marl_pack import renamed
+from marl_pack.checks import shown
 
 CRITIC = "afterstates."
 """Prefix of the critic's weights among an actor's."""
@@ -18,6 +20,52 @@ UNRESUMABLE = (
     "an earlier version wrote it, and its games in play cannot be continued; begin a new run with "
     "--init and the settings of the old one"
 )
+
+
+BEFORE = {"shortcut": False, "context": False}
+"""What a network of format 1 is where its shape does not say so: the first had neither."""
+
+
+def without_removed(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint without the settings that were removed since.
+
+    Raises:
+        ValueError: if one of them has another value than the one that still holds.
+    """
+    current = dict(checkpoint)
+    current["config"] = _without_removed(checkpoint["config"], "config")
+    current["agents"] = {
+        name: _record_without_removed(record, f"agents.{name}")
+        for name, record in checkpoint["agents"].items()
+    }
+    return current
+
+
+def _record_without_removed(record: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return an agent's record without removed settings in its network, and in its teacher's."""
+    current = dict(record)
+    if "network" in record:
+        current["network"] = _without_removed(record["network"], f"{where}.network")
+    if "teacher" in record:
+        current["teacher"] = _record_without_removed(record["teacher"], f"{where}.teacher")
+    return current
+
+
+def _without_removed(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return settings without removed ones, those of their sections included."""
+    current = {}
+    for name, value in settings.items():
+        key = f"{where}.{name}"
+        removed = renamed.removed(key)
+        if removed is None:
+            inner = isinstance(value, Mapping)
+            current[name] = _without_removed(value, key) if inner else value
+        elif type(value) is not type(removed.value) or value != removed.value:
+            raise ValueError(
+                f"{key} = {shown(value)}: was removed, and only {removed.value} can be read: "
+                f"{removed.now}"
+            )
+    return current
 
 
 def from_format_1(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
@@ -60,7 +108,7 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def _network(network: Mapping[str, Any]) -> dict[str, Any]:
     """Return a network's shape with today's names of planes."""
     planes = [renamed.PLANES.get(plane, plane) for plane in network.get("planes", [])]
-    return dict(network) | {"planes": planes}
+    return BEFORE | dict(network) | {"planes": planes}
 
 
 def _critic(weights: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,6 @@ from torch import Tensor
 from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning.cloning import Teacher
-from marl_pack.agents.learning.symmetry import mirror_rollout
 from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
 from marl_pack.game.packing import Packing
@@ -42,7 +41,7 @@ class Seat:
         ppo: of a learner; None where ``frozen`` plays.
         frozen: plays in place of a learner: the games and the choices before → actions int64 [G].
         planes: extra planes that a learner observes.
-        schedule: a learner's settings for :meth:`anneal`, and ``symmetry``.
+        schedule: a learner's settings for :meth:`anneal`.
         teacher: a learner clones its choices at first.
     """
 
@@ -212,9 +211,6 @@ class PackingPPO:
         for seat in self._learning:
             name, ppo = seat.kind.name, seat.ppo
             assert ppo is not None, "it learns"
-            assert seat.schedule is not None, "a learner has one"
-            if seat.schedule["symmetry"]:
-                mirror_rollout(ppo, name)
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
             losses[f"{name}/kl"] = self._divergence(ppo)
             losses[f"{name}/learning_rate"] = ppo.learning_rate
@@ -318,8 +314,7 @@ class PackingPPO:
             env: the games.
             cfg: ``algorithm`` with ``iterations``, ``lookahead``, and ``frozen`` and ``teachers``:
                 agents by name, callables as :class:`Seat` takes them; ``agents``: for each learner
-                ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule``, ``symmetry`` and
-                ``teacher_iterations``.
+                ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule`` and ``teacher_iterations``.
             device: of the networks.
         """
         own = cfg["algorithm"]
@@ -342,8 +337,7 @@ class PackingPPO:
             seats.append(
                 Seat(
                     kind, _stock_ppo(name, settings, example, env, cfg, device), planes=planes,
-                    schedule={**settings["schedule"], "symmetry": settings["symmetry"]},
-                    teacher=teacher,
+                    schedule=settings["schedule"], teacher=teacher,
                 )
             )  # fmt: skip
         afterstates = None
@@ -369,7 +363,7 @@ def _stock_ppo(
     agent_cfg = {
         "algorithm": {
             "class_name": PPO,
-            "share_cnn_encoders": network["share_trunk"],
+            "share_cnn_encoders": True,
             **settings["algorithm"],
         },
         "actor": {"class_name": Actor, **model},

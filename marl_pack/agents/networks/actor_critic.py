@@ -61,7 +61,7 @@ class Critic(MLPModel):
 
     Args:
         obs, obs_groups, obs_set, output_dim, agent, network: as for :class:`Actor`.
-        cnns: the actor's trunk, to use its features instead of having a trunk.
+        cnns: the actor's trunk, whose features the critic uses.
     """
 
     def __init__(
@@ -73,18 +73,14 @@ class Critic(MLPModel):
         *,
         agent: str,
         network: Mapping[str, Any],
-        cnns: Trunk | None = None,
+        cnns: Trunk,
     ) -> None:
         nn.Module.__init__(self)
         shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
         self.distribution = None
-        if cnns is None:
-            self.cnns = Trunk(kind.orientations, shape)
-            self._features = self.cnns.forward
-        else:
-            # Not registered as a part: its weights belong to the actor's state and parameters.
-            self._features = cnns.take
+        # Not registered as a part: its weights belong to the actor's state and parameters.
+        self._features = cnns.take
         self.mlp = pooled_head(shape, kind.orientations, output_dim, 1.0)
 
     def get_latent(
@@ -100,9 +96,9 @@ def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | st
 
 
 def make_critic(
-    agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor | None = None
+    agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor
 ) -> Critic:
-    """Build a critic with new weights; one that shares its actor's trunk needs that actor."""
-    trunk = actor.cnns if actor is not None and Network(**network).share_trunk else None
+    """Build a critic with new weights, which uses the features of its actor's trunk."""
+    trunk = actor.cnns
     critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
     return critic.to(device)

@@ -7,10 +7,15 @@ from dataclasses import dataclass, field
 from marl_pack import renamed
 from marl_pack.agents.networks.planes import PLANES
 from marl_pack.checks import shown, truth_value, whole_number
-from marl_pack.geometry import MAX_SIDE
 
-MOST = {"channels": 4096, "layers": 128, "dilation": MAX_SIDE, "hidden": 65536}
+MOST = {"channels": 4096, "layers": 128, "hidden": 65536}
 """The largest value of each size of a network."""
+
+DEFAULT_PLANES = (
+    "mask", "resting_height", "waste", "feasible_cells", "feasible_probability",
+    "afterstate_value", "grounded",
+)  # fmt: skip
+"""The input planes of a network unless others are given: those that learn best on RS."""
 
 
 @dataclass
@@ -21,30 +26,25 @@ class Network:
         channels: feature channels of the convolutional trunk.
         layers: number of its 3 × 3 convolutions.
         residual: whether each convolution after the first adds to its input.
-        dilation: cells between the taps of each convolution after the first; with 2, three layers
-            reach 5 cells far in place of 3.
         shortcut: whether the heads see the input channels themselves beside the features.
         context: whether features pooled over the whole bin are added to every cell's.
         planes: input planes beside the paper's four channels: any of {planes}.
         hidden: units of the hidden layer in the heads that follow pooling.
-        share_trunk: whether the critic sees the actor's features or has a trunk of its own.
     """
 
     channels: int = 32
     layers: int = 3
     residual: bool = True
-    dilation: int = 1
-    shortcut: bool = False
-    context: bool = False
-    planes: list[str] = field(default_factory=lambda: ["mask", "resting_height", "waste"])
+    shortcut: bool = True
+    context: bool = True
+    planes: list[str] = field(default_factory=lambda: list(DEFAULT_PLANES))
     hidden: int = 64
-    share_trunk: bool = True
 
     def __post_init__(self) -> None:
         for name, most in MOST.items():
             value = getattr(self, name)
             whole_number(value, f"network: {name} = {shown(value)}", 1, most)
-        for name in ("residual", "shortcut", "context", "share_trunk"):
+        for name in ("residual", "shortcut", "context"):
             truth_value(getattr(self, name), f"network: {name}")
         if not isinstance(self.planes, list | tuple) or not all(
             isinstance(plane, str) for plane in self.planes

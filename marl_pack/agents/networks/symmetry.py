@@ -10,7 +10,6 @@ orientations o and o ^ 1. How a tensor of an observation moves follows from its 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,25 +50,6 @@ def mean_probabilities(actor: Actor, observation: Observation, agent: str) -> Te
     return total / symmetries
 
 
-def transform(
-    observation: Observation, actions: Tensor, agent: str, symmetry: Tensor
-) -> tuple[Any, Tensor]:
-    """Apply a symmetry of the bin to the observation and the actions of each of B games.
-
-    Args:
-        observation: of the agent.
-        actions: float or int [B, 1], the agent's actions.
-        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
-        symmetry: int64 [B], bits: 1 mirrors x, 2 mirrors y, then 4 exchanges x and y (W = D).
-
-    Returns:
-        The mirrored observation, and the actions that place the items in the mirrored places.
-    """
-    shape = observation["heightmap"].shape[1:]
-    mirrored = mirror_actions(actions.long(), observation["item"], shape, agent, symmetry)
-    return mirror_observation(observation, agent, symmetry), mirrored.to(actions.dtype)
-
-
 def _exchanged(swap: Tensor, a: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     """Return (a, c), or (c, a) in the games that are exchanged."""
     wide = swap.view(-1, *[1] * (a.dim() - 1))
@@ -90,8 +70,14 @@ def _judged_sides(item: Tensor, kind: AgentKind) -> Tensor:
     return item[:, None] if kind.orientations == 1 else oriented(item)
 
 
-def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -> Any:
-    """Return the observations of :func:`transform`."""
+def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -> dict[str, Tensor]:
+    """Apply a symmetry of the bin to the observation of each of B games.
+
+    Args:
+        observation: of the agent.
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+        symmetry: int64 [B], bits: 1 mirrors x, 2 mirrors y, then 4 exchanges x and y (W = D).
+    """
     kind = AGENT_KINDS[agent]
     flip_x, flip_y, swap = _bits(symmetry)
     heightmap, item = observation["heightmap"], observation["item"]
@@ -139,16 +125,20 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     if kind.orientations == 1:
         exchanged = torch.stack((item[:, 1], item[:, 0], item[:, 2]), 1)
         mirrored["item"] = torch.where(swap[:, None], exchanged, item)
-    if isinstance(observation, dict):
-        return mirrored
-    container: Any = type(observation)  # a TensorDict
-    return container(mirrored, observation.batch_size)  # type: ignore[attr-defined]  # a TensorDict
+    return mirrored
 
 
 def mirror_actions(
     actions: Tensor, item: Tensor, shape: Sequence[int], agent: str, symmetry: Tensor
 ) -> Tensor:
-    """Return the actions of :func:`transform`, any number for each game, int64 [B, K]."""
+    """Return the actions that place the items in the mirrored places, int64 [B, K].
+
+    Args:
+        actions: int64 [B, K], any number of actions for each game.
+        item: the sides of the items, as the agent observes them.
+        shape: W and D of the bin that is mirrored.
+        agent, symmetry: as for :func:`mirror_observation`.
+    """
     # Actions move forwards: first the mirrors, then the exchange.
     kind = AGENT_KINDS[agent]
     flip_x, flip_y, swap = (bit[:, None] for bit in _bits(symmetry))

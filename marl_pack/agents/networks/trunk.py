@@ -72,10 +72,8 @@ class Trunk(nn.Module):
         channels = network.channels
         inputs = len(channel_names(self.planes, orientations))
         widths = [inputs] + [channels] * network.layers
-        dilations = [1] + [network.dilation] * (network.layers - 1)
         self.convolutions = nn.ModuleList(
-            initialized(nn.Conv2d(a, b, 3, padding=d, dilation=d))
-            for (a, b), d in zip(pairwise(widths), dilations, strict=True)
+            initialized(nn.Conv2d(a, b, 3, padding=1)) for a, b in pairwise(widths)
         )
         self.context = initialized(nn.Linear(2 * channels, channels)) if network.context else None
         # (observation, its features), stored by the actor for the critic that shares this trunk.
