@@ -23,7 +23,7 @@ from marl_pack.config import parse
 from marl_pack.training.assembly import make_runner
 
 CONFIGS = Path(__file__).parent.parent / "configs"
-TRAINED = ("paper", "rs")
+TRAINED = ("paper", "plain")
 """Names of the configs whose training is measured."""
 PARTS = ("game", "networks", "rsl_rl", "rest")
 

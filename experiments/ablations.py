@@ -19,7 +19,7 @@ from experiments.rows import Rows, main_of
 from marl_pack import train as training
 from marl_pack.config import parse
 
-BASE = "--config configs/afterstates.yaml"
+BASE = "--config default"
 """Options of the settings that every change is made to."""
 SHORT = "--ppo.max_iterations 80 --evaluation.every 80 --evaluation.episodes 2000"
 SEEDS = (0, 1, 2)

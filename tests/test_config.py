@@ -51,7 +51,7 @@ def test_the_main_config_holds_every_key_at_its_default() -> None:
 
 def test_the_ablations_see_the_same_number_of_items() -> None:
     runs = [parse([f"--config={path}"])[0].ppo for path in FILES if path.parent.name == "ablations"]
-    assert {ppo.num_envs * ppo.num_steps_per_env * ppo.max_iterations for ppo in runs} == {98304}
+    assert {ppo.num_envs * ppo.num_steps_per_env * ppo.max_iterations for ppo in runs} == {81_920}
 
 
 def test_every_key_is_explained_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
