@@ -203,7 +203,8 @@ def _check_player(record: Mapping[str, Any], agent: str, where: str) -> None:
 def without_training(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Return a checkpoint without what only the rest of its run needs, to be published.
 
-    It plays, searches, is exported and begins other runs (``--init``) as before.
+    It plays, searches, is exported and begins other runs (``--init``) as before. Where its run was
+    kept is nobody else's concern, so the section ``output`` of its settings is left out too.
     """
     own = ("format", "marl_pack", "config", "afterstate_critic", "iter", "items", "seconds")
     parts = ("name", "network", "actor_state_dict", "critic_state_dict", "afterstate_critic")
@@ -211,7 +212,9 @@ def without_training(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
         name: {part: agent[part] for part in parts if part in agent}
         for name, agent in checkpoint["agents"].items()
     }
-    return {part: checkpoint[part] for part in own if part in checkpoint} | {"agents": agents}
+    settings = {key: value for key, value in checkpoint["config"].items() if key != "output"}
+    slim = {part: checkpoint[part] for part in own if part in checkpoint}
+    return slim | {"config": settings, "agents": agents}
 
 
 def agent_of(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
