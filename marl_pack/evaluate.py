@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,18 +25,19 @@ from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
 from marl_pack.files import Growing, check_writable, same_plain_file, write_json
-from marl_pack.options import EPILOG, MOST_AT_ONCE, add_options
+from marl_pack.options import GAME_NOTE, MOST_AT_ONCE, add_options, check_names
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
-from marl_pack.plan_archive import save_plans
+from marl_pack.plan_archive import check_ending, save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, judge_all
 from marl_pack.sapien_check.world import SimulationError, load_sapien
-from marl_pack.terminal import PIPED_WIDTH, Parser, make_console, make_progress
+from marl_pack.terminal import PIPED_WIDTH, Parser, make_console, make_progress, make_status
 
 if TYPE_CHECKING:
     from marl_pack.agents.policy import Policy
     from marl_pack.players import Setup
 
+PROGRAM = "python -m marl_pack.evaluate"
 EPISODES = 1000  # of a generated stream, unless --episodes is given
 
 
@@ -91,23 +93,53 @@ def falls_of(row: dict[str, Any]) -> str:
     return f"{row.get('falls', 0)}" + ("" if judged == row["episodes"] else f" of {judged}")
 
 
-def parser() -> Parser:
+def parser(program: str = PROGRAM) -> Parser:
     """Return the parser of the command's options."""
     options = Parser(
-        prog="python -m marl_pack.evaluate",
-        description=__doc__.split("\n\n")[0],
-        epilog=EPILOG,
-    )
+        prog=program, usage=f"{program} [OPTIONS]",
+        description=__doc__.split("\n\n")[0], notes=[GAME_NOTE],
+        examples=(
+            "--policy rs dblf --episodes 100",
+            "--policy runs/NAME --items boxes.csv --bin 12 10 14 --json figures.json",
+            "--policy rs --plan rollouts=16,top=8 --episodes 20",
+            "--policy rs --episodes 100 --physics --save-stacks plans.csv",
+        ),
+    )  # fmt: skip
     add_options(options)
-    add = options.add_argument
-    add("--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})")
+    options.add_argument_group("episodes").add_argument(
+        "--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})"
+    )
+    physics = options.add_argument_group("physics")
+    add = physics.add_argument
     add("--physics", action="store_true",
         help="judge every packing in SAPIEN after each placement: the column falls")  # fmt: skip
-    add_body_options(options)
+    add_body_options(physics)
     add("--processes", type=int, default=1, help="that judge at once (default: 1)")
+    add = options.add_argument_group("output").add_argument
     add("--json", type=Path, metavar="FILE", help="write the figures there")
-    add("--save-stacks", type=Path, metavar="FILE", help="write the packed boxes there (.npz)")
+    add(
+        "--save-stacks",
+        type=Path,
+        metavar="FILE",
+        help="write the packed boxes of every episode there (.npz, .json or .csv)",
+    )
     return options
+
+
+def check_outputs(arguments: argparse.Namespace) -> None:
+    """Refuse files that cannot be written.
+
+    Raises:
+        ValueError: naming the file.
+    """
+    if arguments.save_stacks is not None:
+        check_ending(arguments.save_stacks, "--save-stacks")
+    for path in (arguments.json, arguments.save_stacks):
+        if path is not None:
+            check_writable(path)
+    both = arguments.json, arguments.save_stacks
+    if None not in both and same_plain_file(*both):
+        raise ValueError(f"--json, --save-stacks: {arguments.json}: need two files")
 
 
 def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bodies | None]:
@@ -118,12 +150,6 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
     """
     if arguments.save_stacks and len(setup.policies) > 1:
         raise ValueError("--save-stacks: needs a single policy, as it stores one stack an episode")
-    for path in (arguments.json, arguments.save_stacks):
-        if path is not None:
-            check_writable(path)
-    both = arguments.json, arguments.save_stacks
-    if None not in both and same_plain_file(*both):
-        raise ValueError(f"--json, --save-stacks: {arguments.json}: need two files")
     bodies = chosen_bodies(arguments) if arguments.physics else None
     if bodies is not None:
         load_sapien()  # if it is not installed, its error comes before the games
@@ -155,7 +181,7 @@ def evaluate_policy(
     task = bar.add_task(f"{name}: episodes", total=episodes)
     solving = bar.add_task(f"{name}: equilibria", total=episodes)
     rollout, balanced = Rollout([], 0.0), np.empty(episodes, np.bool_)
-    stacks = Growing(arguments.save_stacks, save_plans)
+    stacks = Growing(arguments.save_stacks, partial(save_plans, policy=name))
     row: dict[str, Any] = {}
     try:
         for part in batches(policy, setup.game, episodes, lambda ended: bar.advance(task, ended)):
@@ -198,10 +224,13 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
-    from marl_pack.players import choose, set_threads  # what plays is slow to import
+    check_names(arguments)
+    check_outputs(arguments)
+    with make_status(console, "loading the players"):
+        from marl_pack.players import choose, set_threads  # slow to import
 
-    set_threads(arguments.threads)
-    setup = choose(arguments, console)
+        set_threads(arguments.threads)
+        setup = choose(arguments, console)
     episodes, bodies = check_options(arguments, setup)
     bar = make_progress(console)
     title = str(setup)
@@ -226,9 +255,9 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     return rows
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """Run the command ``python -m marl_pack.evaluate``; return its exit status."""
-    options = parser()
+    options = parser(program)
     chosen = options.parse_args(arguments)
     try:
         run(chosen, make_console())

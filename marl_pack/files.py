@@ -6,6 +6,7 @@ is whole. Links are followed. A device, a pipe or the program's own output is wr
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import os
@@ -15,7 +16,7 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
@@ -155,6 +156,13 @@ def write_json(path: Path, report: Any) -> None:
     """Write figures as JSON: unknown types as text, NaN refused with ValueError."""
     text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_csv(path: Path, lines: Iterable[Sequence[Any]]) -> None:
+    """Write lines of values as CSV."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
 
 
 class Growing(Generic[T]):

@@ -17,10 +17,13 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled function; None if it is not there or cannot be read."""
         try:
-            return super().load_overload(sig, target_context)
+            compiled = super().load_overload(sig, target_context)
         except (OSError, EOFError, UnpicklingError) as error:
             _Uncached.warn(error)
-            return None
+            compiled = None
+        if compiled is None:
+            _Compiling.announce()
+        return compiled
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write the compiled function if that is possible."""
@@ -28,6 +31,24 @@ class _Cache(FunctionCache):
             super().save_overload(sig, data)
         except (OSError, EOFError, UnpicklingError) as error:
             _Uncached.warn(error)
+
+
+class _Compiling:
+    """The message that code is compiled because the cache does not have it, once a process."""
+
+    say: Callable[[str], object] | None = None
+
+    @classmethod
+    def announce(cls) -> None:
+        """Say so unless that was done before."""
+        if cls.say is not None:
+            cls.say("compiling code that is new here: about 20 seconds, at the first start alone")
+            cls.say = None
+
+
+def announce_compiling(say: Callable[[str], object]) -> None:
+    """Have ``say`` called with a sentence before code is compiled for the first time."""
+    _Compiling.say = say
 
 
 class _Uncached:

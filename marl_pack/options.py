@@ -3,44 +3,69 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.sources import path_of, resolve
 from marl_pack.game.spec import add_arguments
 from marl_pack.items import GENERATED
+from marl_pack.items.generated import no_such_file
 
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
-EPILOG = (
-    "The game is the one that the first checkpoint among the policies was trained on, else RS in a "
-    "bin of 10 x 10 x 10 under hull_alpha; each option changes that."
-)
+GAME_NOTE = """\
+The game is the one that the first learned policy was trained on, else RS in a bin of
+10 x 10 x 10 under hull_alpha; each option changes that. A learned policy is a published
+model, a run's folder or a checkpoint."""
 
 
 def add_options(options: argparse.ArgumentParser) -> None:
     """Add the options of :func:`marl_pack.players.choose` to a command."""
-    add = options.add_argument
+    models, learned = ", ".join(published.models()), "a run's folder or a checkpoint"
+    add = options.add_argument_group("players").add_argument
     add("--policy", nargs="+", metavar="NAME",
-        help=f"one or more of {', '.join((*POLICIES, *published.models()))}, runs' folders or "
-             "checkpoints (default: dblf)")  # fmt: skip
+        help=f"one or more of the heuristics {', '.join(POLICIES)}, of the published models "
+             f"{models}, or {learned} (default: dblf)")  # fmt: skip
     add("--orientation", metavar="NAME",
-        help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, a "
-             "published model, a run's folder or a checkpoint")  # fmt: skip
+        help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, "
+             f"{models}, or {learned}")  # fmt: skip
     add("--placement", metavar="NAME",
-        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, a "
-             "published model, a run's folder or a checkpoint")  # fmt: skip
+        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, {models}, "
+             f"or {learned}")  # fmt: skip
     add("--plan", metavar="rollouts=K,top=M",
         help="learned agents try their M best pairs in K imagined futures before each placement; "
              "depth=D ends each future after D items by the critic's value")  # fmt: skip
     add("--symmetric", action="store_true",
         help="ask learned agents in all symmetries of the bin and take what is most probable on "
              "average; with --plan which pairs to try, not in the imagined futures")  # fmt: skip
+    game = options.add_argument_group("game")
+    add = game.add_argument
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--sides", nargs=2, type=int, metavar=("SHORTEST", "LONGEST"),
         help="sides of generated items, in cells")  # fmt: skip
-    add_arguments(options)
+    add_arguments(game)
     add("--seed", type=int, default=0,
         help="of generated items, random play, futures of --plan and drawn bodies "
              "(default: 0)")  # fmt: skip
+    add = options.add_argument_group("computation").add_argument
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     add("--threads", type=int, default=1, help="on the CPU (default: 1)")
+
+
+def check_names(arguments: argparse.Namespace) -> None:
+    """Refuse players and items that do not exist.
+
+    What plays is slow to import, so commands call this first.
+
+    Raises:
+        ValueError, FileNotFoundError: naming what would be right.
+    """
+    players = [(name, POLICIES) for name in arguments.policy or ()]
+    players += [(arguments.orientation, ORIENTATION_AGENTS), (arguments.placement, POLICIES)]
+    for name, names in players:
+        if name is not None and name not in names:
+            resolve(path_of(name, names))
+    items = arguments.items
+    if items is not None and items not in GENERATED and not Path(items).is_file():
+        raise no_such_file(items)

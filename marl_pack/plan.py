@@ -7,8 +7,6 @@ and writes JSON and CSV, which are meant for other programs; archives of many pl
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.checks import decimals, number_in, real_number, whole_number
-from marl_pack.files import write_atomically, write_json
+from marl_pack.files import write_csv, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
 from marl_pack.items.names import check_names
@@ -43,7 +41,7 @@ BOX = (
 KEYS = (UNIT, "bins", "boxes")
 """Keys of a plan in JSON."""
 COLUMNS = (*BOX, "bin_w", "bin_d", "bin_h", UNIT)
-"""Columns of a CSV file: every row repeats the size of its bin and the unit."""
+"""Columns of a CSV file: every line repeats the size of its bin and the unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,29 +259,29 @@ class Plan:
             columns("centre_x", "centre_y"), table.get("id", ()), unit_mm,
         )  # fmt: skip
 
-    def to_json(self, path: str | Path) -> None:
-        """Write the plan as JSON: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as JSON has it: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
 
         Each box is an object with the keys :data:`BOX`.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
-        write_json(
-            Path(path), {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes}
-        )
+        return {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes}
 
     @classmethod
-    def from_json(cls, path: str | Path) -> Plan:
-        """Read a plan that :meth:`to_json` wrote.
+    def of_dict(cls, content: Any, source: str) -> Plan:
+        """Return the plan of an object as :meth:`to_dict` returns it.
+
+        Args:
+            content: as JSON has it.
+            source: where it comes from, for messages.
 
         Raises:
-            ValueError: if it is another kind of file, or for an impossible value.
+            ValueError: if it is another kind of object, or for an impossible value.
         """
-        path = Path(path)
-        source = f"{path}: not a plan in JSON"
-        content = read_json(path)
+        what = f"{source}: not a plan in JSON"
         if not isinstance(content, dict):
-            raise ValueError(f"{source}: needs an object with the keys {', '.join(KEYS)}")
-        check_names(content, KEYS, KEYS, source, "key")
+            raise ValueError(f"{what}: needs an object with the keys {', '.join(KEYS)}")
+        check_names(content, KEYS, KEYS, what, "key")
         sizes, boxes = content["bins"], content["boxes"]
         try:
             if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
@@ -301,32 +299,79 @@ class Plan:
             if content[UNIT] is not None:
                 real_number(content[UNIT], UNIT)
         except ValueError as error:
-            raise ValueError(f"{source}: {error}") from None
+            raise ValueError(f"{what}: {error}") from None
         try:
             return cls._of_rows(sizes, rows, content[UNIT])
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{source}: {error}") from None
 
-    def to_csv(self, path: str | Path) -> None:
-        """Write the plan as CSV: a header line, then one line for each box, in order.
+    def to_json(self, path: str | Path) -> None:
+        """Write the plan as JSON (:meth:`to_dict`)."""
+        write_json(Path(path), self.to_dict())
 
-        The columns are :data:`COLUMNS`. Each line says the size of its bin and the unit
-        (``unit_mm``, empty for abstract cells), so that a reader needs nothing else.
+    @classmethod
+    def from_json(cls, path: str | Path) -> Plan:
+        """Read a plan that :meth:`to_json` wrote.
 
         Raises:
-            ValueError: if a bin is empty: only JSON can hold it.
+            ValueError: if it is another kind of file, or for an impossible value.
         """
-        empty = sorted(set(range(len(self.bin_sizes))) - set(self.bins.tolist()))
-        if empty:
-            raise ValueError(f"{path}: bin {empty[0]} is empty: needs JSON, as CSV cannot hold it")
+        return cls.of_dict(read_json(Path(path)), str(path))
+
+    def to_lines(self) -> list[list[Any]]:
+        """Return the values of :data:`COLUMNS` for each box, in order, then for each empty bin.
+
+        Each line says the size of its bin and the unit (``unit_mm``, empty for abstract cells), so
+        that a reader needs nothing else. An empty bin has no values of a box.
+        """
         unit = "" if self.unit_mm is None else self.unit_mm
-        sizes = self.bin_sizes[self.bins].tolist()
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        rows = zip(self._rows(), sizes, strict=True)
-        writer.writerows([*row, *size, unit] for row, size in rows)
-        write_atomically(Path(path), lambda file: file.write(text.getvalue().encode()))
+        sizes = self.bin_sizes.tolist()
+        lines = [[*row, *sizes[row[1]], unit] for row in self._rows()]
+        used = set(self.bins.tolist())
+        nothing = [""] * (len(BOX) - 2)
+        return lines + [
+            ["", k, *nothing, *size, unit] for k, size in enumerate(sizes) if k not in used
+        ]
+
+    @classmethod
+    def of_lines(cls, lines: Sequence[Sequence[str]], source: str) -> Plan:
+        """Return the plan of the lines of a CSV file.
+
+        Args:
+            lines: as :meth:`to_lines` returns them, all values as text.
+            source: where they come from, for messages.
+
+        Raises:
+            ValueError: if they are other lines, or for an impossible value.
+        """
+        sizes: dict[int, list[Any]] = {}
+        rows, units = [], set()
+        for number, line in enumerate(lines):
+            try:
+                if len(line) != len(COLUMNS):
+                    raise ValueError(f"has {len(line)} values, needs {len(COLUMNS)}")
+                name, index, *values, width, depth, height, unit = line
+                size = [number_in(side) for side in (width, depth, height)]
+                row: list[Any] = [name, number_in(index)]
+                if name or any(values):
+                    row += map(number_in, values)
+                    _check_row(row, "it")
+                    rows.append(row)
+                if sizes.setdefault(row[1], size) != size:
+                    raise ValueError(f"bin {row[1]} has another size than before")
+                units.add(number_in(unit) if unit else None)
+            except ValueError as error:
+                raise ValueError(f"{source}: box {number}: {error}") from None
+        if len(units) != 1 or sorted(sizes) != list(range(len(sizes))):
+            raise ValueError(f"{source}: needs one unit, and bins numbered from 0 without a gap")
+        try:
+            return cls._of_rows([sizes[k] for k in sorted(sizes)], rows, units.pop())
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the plan as CSV: the names :data:`COLUMNS`, then :meth:`to_lines`."""
+        write_csv(Path(path), [COLUMNS, *self.to_lines()])
 
     @classmethod
     def from_csv(cls, path: str | Path) -> Plan:
@@ -339,27 +384,7 @@ class Plan:
         (_, header), *lines = list(read_lines(path)) or [(0, [])]
         if header != list(COLUMNS) or not lines:
             raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and a line for a box")
-        sizes: dict[int, list[Any]] = {}
-        rows, units = [], set()
-        for number, (_, line) in enumerate(lines):
-            try:
-                if len(line) != len(COLUMNS):
-                    raise ValueError(f"has {len(line)} values, needs {len(COLUMNS)}")
-                name, *values, unit = line
-                row: list[Any] = [name, *map(number_in, values)]
-                _check_row(row[:-3], "it")
-                if sizes.setdefault(row[1], row[-3:]) != row[-3:]:
-                    raise ValueError(f"bin {row[1]} has another size than before")
-                rows.append(row[:-3])
-                units.add(number_in(unit) if unit else None)
-            except ValueError as error:
-                raise ValueError(f"{path}: box {number}: {error}") from None
-        if len(units) > 1 or sorted(sizes) != list(range(len(sizes))):
-            raise ValueError(f"{path}: needs one unit, and bins numbered from 0 without a gap")
-        try:
-            return cls._of_rows([sizes[k] for k in sorted(sizes)], rows, units.pop())
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        return cls.of_lines([line for _, line in lines], str(path))
 
 
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:

@@ -1,4 +1,12 @@
-"""Archives of many plans: the ``.npz`` files that ``evaluate --save-stacks`` writes.
+"""Archives of many plans, one for each episode: the files that ``evaluate --save-stacks`` writes.
+
+The ending of the file says what it is:
+
+- ``.npz``: NumPy arrays, the smallest and fastest to read;
+- ``.json``: an object with ``policy`` and ``plans``, each an ``episode`` beside the keys of
+  :meth:`marl_pack.plan.Plan.to_dict`;
+- ``.csv``: a line for each box, with ``policy`` and ``episode`` before the columns of
+  :meth:`marl_pack.plan.Plan.to_lines`.
 
 Shapes use the letters E (plans), M (the most boxes of any plan) and B (the most bins of any plan).
 """
@@ -6,35 +14,72 @@ Shapes use the letters E (plans), M (the most boxes of any plan) and B (the most
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.files import write_atomically
-from marl_pack.inputs import read_arrays
+from marl_pack.checks import shown
+from marl_pack.files import write_atomically, write_csv, write_json
+from marl_pack.inputs import read_arrays, read_json, read_lines
 from marl_pack.items.names import check_names
-from marl_pack.plan import UNIT, Plan
+from marl_pack.plan import COLUMNS, UNIT, Plan
 
 NOT_PLANS = "not a file of plans, as evaluate --save-stacks writes it"
 REQUIRED = ("bin", "count", "boxes", "loads")
 NAMES = (*REQUIRED, "utilization", "orientations", "ids", "bins", UNIT)
 """Names of the arrays of an archive."""
+ENDINGS = (".npz", ".json", ".csv")
+OF_PLAN = ("policy", "episode")
+"""The first columns of a CSV file of many plans."""
 
 
-def save_plans(path: Path, plans: Sequence[Plan]) -> None:
-    """Save plans as ``.npz``, rows past a plan's number of boxes filled with zeros.
+def check_ending(path: Path, option: str) -> None:
+    """Raise ValueError unless the ending of a file of plans says what it is."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ValueError(f"{option} {path}: needs one of the endings {', '.join(ENDINGS)}")
 
-    The arrays are ``bin`` ([3], or [E, B, 3] unless every plan has one bin of the same size),
-    ``count`` [E], ``boxes`` [E, M, 6], ``loads`` [E, M, 3], ``utilization`` [E], ``orientations``,
-    ``ids`` and ``bins`` [E, M], and ``unit_mm`` [E] (NaN: abstract cells).
+
+def save_plans(path: Path, plans: Sequence[Plan], policy: str = "") -> None:
+    """Save plans as ``.json``, ``.csv`` or, with any other ending, as ``.npz``.
+
+    Args:
+        path: of the file.
+        plans: one for each episode, from 0 on.
+        policy: who packed them; ``.npz`` does not hold it.
 
     Raises:
         ValueError: if there are no plans.
     """
     if not plans:
         raise ValueError(f"{path}: there are no plans to save")
+    numbered = list(enumerate(plans))
+    if path.suffix.lower() == ".json":
+        content = [{"episode": e} | plan.to_dict() for e, plan in numbered]
+        write_json(path, {"policy": policy, "plans": content})
+    elif path.suffix.lower() == ".csv":
+        lines = ([policy, e, *line] for e, plan in numbered for line in plan.to_lines())
+        write_csv(path, [(*OF_PLAN, *COLUMNS), *lines])
+    else:
+        _save_arrays(path, plans)
+
+
+def save_plan(path: Path, plan: Plan) -> None:
+    """Save one plan by the ending of the file: alone in JSON and CSV, as an archive of one else."""
+    writers = {".json": plan.to_json, ".csv": plan.to_csv}
+    write = writers.get(path.suffix.lower(), lambda path: save_plans(path, [plan]))
+    write(path)
+
+
+def _save_arrays(path: Path, plans: Sequence[Plan]) -> None:
+    """Save plans as ``.npz``, rows past a plan's number of boxes filled with zeros.
+
+    The arrays are ``bin`` ([3], or [E, B, 3] unless every plan has one bin of the same size),
+    ``count`` [E], ``boxes`` [E, M, 6], ``loads`` [E, M, 3], ``utilization`` [E], ``orientations``,
+    ``ids`` and ``bins`` [E, M], and ``unit_mm`` [E] (NaN: abstract cells).
+    """
     sizes = _padded([plan.bin_sizes for plan in plans])
     boxes = _padded([plan.boxes for plan in plans])
     if boxes.dtype.kind == "i" and boxes.max(initial=0) <= np.iinfo(np.int16).max:
@@ -65,13 +110,60 @@ def _padded(rows: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def load_plans(path: str | Path) -> list[Plan]:
-    """Read an archive of plans, also one without orientations, ids, bins and units.
+    """Read an archive of plans, or a single plan that is a file of its own.
 
     Raises:
         ValueError: if it is another kind of file, or for an impossible value.
     """
+    path = Path(path)
+    if path.suffix.lower() == ".json":
+        return _load_json(path)
+    if path.suffix.lower() == ".csv":
+        return _load_csv(path)
+    return _load_arrays(path)
+
+
+def _load_json(path: Path) -> list[Plan]:
+    """Read plans from JSON."""
+    content = read_json(path)
+    if not isinstance(content, dict) or "plans" not in content:
+        return [Plan.of_dict(content, str(path))]
+    check_names(content, ("policy", "plans"), ("plans",), str(path), "key")
+    if not isinstance(content["plans"], list) or not content["plans"]:
+        raise ValueError(f"{path}: {NOT_PLANS}: plans needs a list of plans")
+    plans = []
+    for e, each in enumerate(content["plans"]):
+        if not isinstance(each, dict) or each.get("episode") != e:
+            raise ValueError(f"{path}: plan {e}: needs an object whose episode is {e}")
+        own = {key: value for key, value in each.items() if key != "episode"}
+        plans.append(Plan.of_dict(own, f"{path}: episode {e}"))
+    return plans
+
+
+def _load_csv(path: Path) -> list[Plan]:
+    """Read plans from CSV."""
+    (_, header), *lines = list(read_lines(path)) or [(0, [])]
+    if header[: len(OF_PLAN)] != list(OF_PLAN):
+        return [Plan.from_csv(path)]
+    if header != [*OF_PLAN, *COLUMNS] or not lines:
+        needs = ",".join((*OF_PLAN, *COLUMNS))
+        raise ValueError(f"{path}: {NOT_PLANS}: needs the columns {needs} and a line for a box")
+    plans: list[Plan] = []
+    for episode, group in groupby((line for _, line in lines), lambda line: line[1:2]):
+        if episode != [str(len(plans))]:
+            raise ValueError(
+                f"{path}: needs the boxes of episode {len(plans)} together and before those of "
+                f"{shown(episode[0] if episode else '')}"
+            )
+        own = [line[len(OF_PLAN) :] for line in group]
+        plans.append(Plan.of_lines(own, f"{path}: episode {len(plans)}"))
+    return plans
+
+
+def _load_arrays(path: Path) -> list[Plan]:
+    """Read plans from NumPy arrays, also from those without orientations, ids, bins and units."""
     try:
-        arrays = read_arrays(Path(path))
+        arrays = read_arrays(path)
         check_names(arrays, NAMES, REQUIRED, str(path), "array")
     except ValueError as error:
         raise ValueError(f"{path}: {NOT_PLANS}{str(error).removeprefix(str(path))}") from None

@@ -1,7 +1,7 @@
 """Play one game, turn by turn, and draw the packed bin.
 
-``python -m marl_pack.play --policy models/rs.pt --picture play.png`` prints each item, its
-orientation and its place, then writes a picture of the bin at the end.
+``python -m marl_pack.play --policy rs --picture play.png`` prints each item, its orientation and
+its place, then writes a picture of the bin at the end. ``--save`` writes the plan of the bin.
 """
 
 from __future__ import annotations
@@ -17,23 +17,33 @@ from rich.table import Table
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.options import EPILOG, add_options
+from marl_pack.options import GAME_NOTE, add_options, check_names
 from marl_pack.plan import Plan
-from marl_pack.terminal import Parser, make_console
+from marl_pack.plan_archive import check_ending, save_plan
+from marl_pack.terminal import Parser, make_console, make_status
+
+PROGRAM = "python -m marl_pack.play"
 
 
-def parser() -> Parser:
+def parser(program: str = PROGRAM) -> Parser:
     """Return the parser of the command's options."""
     options = Parser(
-        prog="python -m marl_pack.play",
-        description=__doc__.split("\n\n")[0],
-        epilog=EPILOG,
-    )
+        prog=program, usage=f"{program} [OPTIONS]",
+        description=__doc__.split("\n\n")[0], notes=[GAME_NOTE],
+        examples=(
+            "--policy rs --picture bin.png",
+            "--policy runs/NAME --items boxes.csv --episode 3 --save plan.json",
+        ),
+    )  # fmt: skip
     add_options(options)
-    add = options.add_argument
-    add("--episode", type=int, default=0, help="number of the sequence (default: 0)")
+    options.add_argument_group("episode").add_argument(
+        "--episode", type=int, default=0, help="number of the sequence (default: 0)"
+    )
+    add = options.add_argument_group("output").add_argument
     add("--picture", type=Path, default=Path("play.png"),
         help="where to draw the bin (default: play.png)")  # fmt: skip
+    add("--save", type=Path, metavar="FILE",
+        help="write the packed boxes there (.json, .csv or .npz)")  # fmt: skip
     return options
 
 
@@ -46,12 +56,17 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     if chosen.picture.suffix.lower() != ".png":
         raise ValueError(f"--picture {chosen.picture}: needs the ending .png")
     check_writable(chosen.picture)
-    from marl_pack.players import choose, set_threads  # what plays is slow to import
+    if chosen.save is not None:
+        check_ending(chosen.save, "--save")
+        check_writable(chosen.save)
+    check_names(chosen)
+    with make_status(console, "loading the player"):
+        from marl_pack.players import choose, set_threads  # slow to import
 
-    set_threads(chosen.threads)
-    setup = choose(chosen, console)
+        set_threads(chosen.threads)
+        setup = choose(chosen, console)
     if len(setup.policies) > 1:
-        raise ValueError("--policy: needs one policy; marl_pack.evaluate compares several")
+        raise ValueError("--policy: needs one policy; the command evaluate compares several")
     ((name, policy),) = setup.policies.items()
     episodes = setup.stream.episodes
     if chosen.episode < 0 or (episodes and chosen.episode >= episodes):
@@ -62,21 +77,23 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     table = Table()
     for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
         table.add_column(column, justify="right")
-    while bool(game.alive):
-        item, count = game.items.sides[0].tolist(), int(game.bins.count)
-        orientation, cell = policy(game)
-        outcome = game.place(orientation, cell)
-        # Without a mask of orientations the chosen one may have no legal cell: that ends the game.
-        placed = int(outcome.placed) > count
-        axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
-        table.add_row(
-            str(count + 1),
-            " ".join(map(str, item)),
-            axes,
-            " ".join(map(str, game.bins.boxes[0, count, :3].tolist())) if placed else "nowhere",
-            f"{float(outcome.reward):+.3f}",
-            f"{float(outcome.utilization):.1%}",
-        )
+    with make_status(console, "playing") as status:
+        while bool(game.alive):
+            item, count = game.items.sides[0].tolist(), int(game.bins.count)
+            status.update(f"playing: item {count + 1}")
+            orientation, cell = policy(game)
+            outcome = game.place(orientation, cell)
+            # Without a mask of orientations the choice may have no legal cell: that ends the game.
+            placed = int(outcome.placed) > count
+            axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
+            table.add_row(
+                str(count + 1),
+                " ".join(map(str, item)),
+                axes,
+                " ".join(map(str, game.bins.boxes[0, count, :3].tolist())) if placed else "nowhere",
+                f"{float(outcome.reward):+.3f}",
+                f"{float(outcome.utilization):.1%}",
+            )
     console.print(title, soft_wrap=True)
     console.print(table)
 
@@ -88,14 +105,18 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     balance = "in strict equilibrium" if strict_equilibrium(plan) else "NOT in equilibrium"
     ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)
-    image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
-    write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
+    with make_status(console, "drawing the bin"):
+        image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
+        write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
     console.print(f"picture: {chosen.picture}", soft_wrap=True)
+    if chosen.save is not None:
+        save_plan(chosen.save, plan)
+        console.print(f"plan: {chosen.save}", soft_wrap=True)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """Run the command ``python -m marl_pack.play``; return its exit status."""
-    options = parser()
+    options = parser(program)
     chosen = options.parse_args(arguments)
     try:
         run(chosen, make_console())

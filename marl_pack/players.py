@@ -27,6 +27,7 @@ from marl_pack.items import (
     choose_stream,
 )
 from marl_pack.options import MOST_AT_ONCE
+from marl_pack.terminal import announce_compiling
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
+    announce_compiling(console)
     check_device(arguments.device)
     whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
     policies, learned = choose_policies(arguments, console)

@@ -55,6 +55,12 @@ def did_you_mean(name: str | None) -> str:
     return f"; did you mean {name!r}?" if name else "."
 
 
+def guess(name: str, valid: Iterable[str]) -> str:
+    """Return the end of a message that asks for the nearest valid name; empty if none is near."""
+    near = nearest(name, valid)
+    return did_you_mean(near) if near else ""
+
+
 def refuse_old(name: str, names: Mapping[str, str], kind: str) -> None:
     """Raise ValueError with the new name if ``name`` is an old one.
 

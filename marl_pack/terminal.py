@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NoReturn
 
@@ -22,9 +23,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.status import Status
 from rich.text import Text
 
-from marl_pack.checks import one_line, printable
+from marl_pack import renamed
+from marl_pack.checks import one_line, printable, shown
 
 PIPED_WIDTH = 1000
 """Columns of output that is not a terminal's, so that no table is cut."""
@@ -55,11 +58,25 @@ class _Name(TextColumn):
 
 
 def make_progress(console: Console) -> Progress:
-    """Return a progress bar that is removed when the work is done."""
+    """Return a progress bar that is removed when the work is done; none in piped output."""
     return Progress(
         _Name(""), BarColumn(), MofNCompleteColumn(),
         TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True,
+        disable=not console.is_terminal,
     )  # fmt: skip
+
+
+def announce_compiling(console: Console) -> None:
+    """Say on a terminal when the first start has to compile code, which takes some seconds."""
+    if console.is_terminal:
+        from marl_pack.installation import announce_compiling  # imports Numba
+
+        announce_compiling(console.print)
+
+
+def make_status(console: Console, text: str) -> Status:
+    """Return a line that says what is being done until it is done; none in piped output."""
+    return console.status(Text(printable(text)))
 
 
 def _decimal(kind: type[int] | type[float], text: str) -> float:
@@ -72,17 +89,56 @@ def _decimal(kind: type[int] | type[float], text: str) -> float:
 class Parser(argparse.ArgumentParser):
     """A parser of a command's options whose errors are one printable line.
 
-    Numbers are decimal: Python's ``1_0`` is none.
+    The line says which name was probably meant. Numbers are decimal: Python's ``1_0`` is none.
+
+    Args:
+        notes: paragraphs to stand below the options, as they are.
+        examples: uses of the command, without its name.
+        **options: of :class:`argparse.ArgumentParser`.
     """
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self, *, notes: Sequence[str] = (), examples: Sequence[str] = (), **options: Any
+    ) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
         for kind in (int, float):
             self.register("type", kind, partial(_decimal, kind))
+        self.epilog = below_options(self.prog, notes, examples)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse the arguments; refuse those that belong to no option."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        for word in unknown:
+            option = word.partition("=")[0]
+            if option.startswith("-"):
+                guess = renamed.guess(option, self._option_string_actions)
+                self.error(f"unknown option {shown(option)}{guess or '; --help lists them'}")
+        if unknown:
+            self.error(f"{shown(unknown[0])}: belongs to no option")
+        return parsed, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a value that is none of the choices."""
+        choices = list(action.choices or [value])
+        if value not in choices:
+            names = list(map(str, choices))
+            guess = renamed.guess(str(value), names)
+            message = f"{shown(value)}: needs one of {', '.join(names)}{guess}"
+            raise argparse.ArgumentError(action, message)
+
+    def error(self, message: str) -> NoReturn:
+        """End the program with status 2 and a message."""
+        self.exit(2, f"{self.prog}: {message}")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End the program with a status and a message."""
         super().exit(status, None if message is None else f"{one_line(message)}\n")
+
+
+def below_options(program: str, notes: Sequence[str], examples: Sequence[str]) -> str:
+    """Return what stands below the options in a command's help: notes, then examples."""
+    uses = "\n".join(f"  {program} {example}" for example in examples)
+    return "\n\n".join([*notes, *([f"examples:\n{uses}"] if uses else [])])
 
 
 def complain(program: str, error: object) -> None:

@@ -12,23 +12,23 @@ import sys
 from collections.abc import Sequence
 
 from marl_pack.config import ConfigError, parse
-from marl_pack.terminal import complain
+from marl_pack.config.parsing import PROGRAM
+from marl_pack.terminal import complain, make_console, make_status
 
-PROGRAM = "python -m marl_pack.train"
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """Run the command ``python -m marl_pack.train``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         run, rest = _resume_option(words)
-        config = parse(words)[0] if run is None else None
+        config = parse(words, program)[0] if run is None else None
     except (ConfigError, OSError) as error:
-        complain(PROGRAM, error)
+        complain(program, error)
         return 2
-    from marl_pack.training.run import start  # what trains is slow to import
+    with make_status(make_console(), "loading what trains"):
+        from marl_pack.training.run import start  # slow to import
 
-    return start(PROGRAM, words, config, run or "", rest)
+    return start(program, words, config, run or "", rest)
 
 
 def _resume_option(words: Sequence[str]) -> tuple[str | None, list[str]]:

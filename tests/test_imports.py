@@ -18,7 +18,7 @@ LAYERS = (
     ("env_aec", "vec_env", "agents"),
     ("evaluation",),
     # The programs, and what only they use.
-    ("config", "evaluate", "export", "integrations", "options", "physics", "play", "players",
+    ("cli", "config", "evaluate", "export", "integrations", "options", "physics", "play", "players",
      "train", "training"),
 )  # fmt: skip
 

@@ -11,7 +11,7 @@ import torch
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.game.packing import Packing
 from marl_pack.plan import COLUMNS, Plan
-from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.plan_archive import ENDINGS, load_plans, save_plan, save_plans
 
 BIN = (10, 10, 10)
 ROWS = [(0, 0, 0, 4, 4, 2), (1, 0, 2, 3, 4, 1)]
@@ -102,7 +102,7 @@ def test_json_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
     assert again.sides.dtype == plan.sides.dtype
 
 
-@pytest.mark.parametrize("plan", ALL)
+@pytest.mark.parametrize("plan", [*ALL, NOTHING, replace(SEVERAL, bins=np.zeros(3, np.int64))])
 def test_csv_reads_back_as_it_was(plan: Plan, tmp_path: Path) -> None:
     path = tmp_path / "plan.csv"
     plan.to_csv(str(path))
@@ -120,11 +120,10 @@ def test_a_line_of_csv_holds_everything_about_its_box(tmp_path: Path) -> None:
     assert first == "a,1,0,0,0,2,2,2,0,8.0,1.0,1.0,5,6,7,10.0"
 
 
-def test_an_empty_bin_is_not_written_as_csv(tmp_path: Path) -> None:
-    for plan in (NOTHING, replace(SEVERAL, bins=np.zeros(3, np.int64))):
-        with pytest.raises(ValueError, match=r"bin \d is empty.*JSON"):
-            plan.to_csv(tmp_path / "plan.csv")
-    assert not list(tmp_path.iterdir())
+def test_an_empty_bin_is_a_line_of_csv_with_its_size_alone(tmp_path: Path) -> None:
+    path = tmp_path / "plan.csv"
+    replace(SEVERAL, bins=np.zeros(3, np.int64)).to_csv(path)
+    assert path.read_text().splitlines()[-1] == ",1,,,,,,,,,,,5,6,7,10.0"
 
 
 @pytest.mark.parametrize(("text", "why"), [
@@ -169,12 +168,21 @@ def test_the_columns_of_csv_are_distinct() -> None:
     assert len(set(COLUMNS)) == len(COLUMNS)
 
 
+@pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("plans", [[PLAIN], [PLAIN, NAMED, NOTHING], list(ALL), [NOTHING]])
-def test_archives_read_back_as_they_were(plans: list[Plan], tmp_path: Path) -> None:
+def test_archives_read_back_as_they_were(plans: list[Plan], ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"plans{ending}"
+    save_plans(path, plans, "rs, plan rollouts=16,top=8")
+    assert load_plans(path) == plans
+    for plan in plans:
+        save_plan(path, plan)
+        assert load_plans(path) == [plan]
+
+
+@pytest.mark.parametrize("plans", [[PLAIN], [PLAIN, NAMED, NOTHING], list(ALL), [NOTHING]])
+def test_an_archive_of_arrays_holds_what_its_page_says(plans: list[Plan], tmp_path: Path) -> None:
     path = tmp_path / "plans.npz"
     save_plans(path, plans)
-    again = load_plans(path)
-    assert again == plans
     with np.load(path) as archive:
         assert archive["count"].tolist() == [len(plan) for plan in plans]
         assert archive["utilization"].tolist() == [plan.utilization for plan in plans]
@@ -183,9 +191,40 @@ def test_archives_read_back_as_they_were(plans: list[Plan], tmp_path: Path) -> N
         assert archive["boxes"].dtype == (np.int16 if one else np.float64)
 
 
-def test_no_plans_make_no_archive(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_no_plans_make_no_archive(ending: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no plans"):
-        save_plans(tmp_path / "plans.npz", [])
+        save_plans(tmp_path / f"plans{ending}", [])
+
+
+def test_a_line_of_a_csv_archive_names_the_policy_and_the_episode(tmp_path: Path) -> None:
+    path = tmp_path / "plans.csv"
+    save_plans(path, [NAMED, PLAIN], "dblf")
+    header, *lines = path.read_text().splitlines()
+    assert header == ",".join(("policy", "episode", *COLUMNS))
+    assert [line.split(",")[:2] for line in lines] == [["dblf", k] for k in "0011"]
+
+
+@pytest.mark.parametrize(("name", "change", "why"), [
+    ("s.csv", lambda text: text.replace("\n,1,", "\n,2,"), "episode 1 together and before"),
+    ("s.csv", lambda text: text.replace("\n,1,", "\n,0,"), "episode 0: needs one unit"),
+    ("s.csv", lambda text: text.replace("unit_mm", "unit"), "needs the columns policy,episode"),
+    ("s.csv", lambda text: f"{text}x\n", "episode 2 together and before those of ''"),
+    ("s.csv", lambda text: text.replace(",12.5", ",cm"), "episode 1: box 0: 'cm' is not a number"),
+    ("s.json", lambda text: text.replace('"episode": 1', '"episode": 2'), "plan 1: .*episode is 1"),
+    ("s.json", lambda text: text.replace('"unit_mm": 12.5', '"unit": 1'), "episode 1: .*unit_mm"),
+    ("s.json", lambda text: '{"plans": []}', "plans needs a list"),
+    ("s.json", lambda text: '{"plans": [], "policies": ""}', "unknown key 'policies'"),
+])  # fmt: skip
+def test_an_archive_of_text_that_is_wrong_is_refused(
+    name: str, change: Callable[[str], str], why: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    save_plans(path, [PLAIN, NAMED])
+    path.write_text(change(path.read_text()))
+    with pytest.raises(ValueError, match=why) as refused:
+        load_plans(path)
+    assert str(path) in str(refused.value)
 
 
 def test_older_archives_are_read(tmp_path: Path) -> None:

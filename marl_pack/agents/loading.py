@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from marl_pack import published, renamed
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.lookahead import Lookahead, Memo
 from marl_pack.agents.heuristics import (
@@ -31,6 +29,7 @@ from marl_pack.agents.policy import (
     Policy,
 )
 from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.agents.sources import path_of
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import Size
 from marl_pack.items import GENERATED, Stream, independent, make_stream
@@ -71,7 +70,7 @@ class Loader:
         """
         if isinstance(source, str) and source in POLICIES:
             return make_policy(source, self.seed, self.device)
-        checkpoint = checkpoints.read(_path(source, POLICIES), self.device)
+        checkpoint = checkpoints.read(path_of(source, POLICIES), self.device)
         with _named(source):
             return self.policy_of(checkpoint)
 
@@ -82,7 +81,7 @@ class Loader:
             ValueError, FileNotFoundError: if there is no such agent.
         """
         if source not in ORIENTATION_AGENTS:
-            checkpoint = checkpoints.read(_path(source, ORIENTATION_AGENTS), self.device)
+            checkpoint = checkpoints.read(path_of(source, ORIENTATION_AGENTS), self.device)
             if JOINT in checkpoint["agents"]:
                 with _named(source):
                     policy = self.policy_of(checkpoint)
@@ -284,7 +283,7 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     """
     if source in checkpoints.HEURISTICS[name]:
         return {"name": source}
-    checkpoint = checkpoints.read(_path(source, checkpoints.HEURISTICS[name]))
+    checkpoint = checkpoints.read(path_of(source, checkpoints.HEURISTICS[name]))
     with _named(source):
         return checkpoints.agent_record(checkpoint, name)
 
@@ -325,13 +324,3 @@ def _named(source: str | Path) -> Iterator[None]:
     except ValueError as error:
         named = str(error).startswith(f"{source}") or repr(str(source)) in str(error)
         raise ValueError(str(error) if named else f"{source}: {error}") from None
-
-
-def _path(source: str | Path, names: Sequence[str]) -> Path:
-    """Return the path of the checkpoint or the run's folder that ``source`` names.
-
-    Raises:
-        ValueError: if it is no path and no published model's name; says what would be right.
-    """
-    renamed.refuse_old(str(source), renamed.POLICIES, "policy")
-    return published.model(source, names)

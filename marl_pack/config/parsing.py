@@ -6,6 +6,7 @@ import contextlib
 import re
 import sys
 import types
+from argparse import RawDescriptionHelpFormatter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import is_dataclass
 from itertools import pairwise
@@ -13,12 +14,13 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
-from jsonargparse import ArgumentError, ArgumentParser, Namespace
+from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace
 
 from marl_pack import published, renamed
 from marl_pack.checks import TYPE_NAMES, one_line, shown
 from marl_pack.config.checks import ConfigError, check
 from marl_pack.config.schema import Config
+from marl_pack.terminal import below_options
 
 MOST_BYTES = 100_000
 """Largest file of settings."""
@@ -43,11 +45,26 @@ NULLS = (None, "null", "Null", "NULL", "~")
 """What stands for no value; on the command line a text may be any of them."""
 
 
-def make_parser() -> ArgumentParser:
+PROGRAM = "python -m marl_pack.train"
+EXAMPLES = (
+    "--config quick --output.name NAME",
+    "--config my.yaml --game.bin=[12,10,14] --seed 1",
+    "--resume runs/NAME --ppo.max_iterations 5000",
+)
+
+
+class _Help(DefaultHelpFormatter, RawDescriptionHelpFormatter):
+    """A formatter that leaves the examples as they are."""
+
+
+def make_parser(program: str = PROGRAM) -> ArgumentParser:
     """Return the options of ``python -m marl_pack.train``: every key of :class:`Config`."""
     parser = ArgumentParser(
-        prog="python -m marl_pack.train",
+        prog=program,
+        usage=f"{program} [--config NAME] [--KEY VALUE ...]",
         description="Train the orientation and the placement agent.",
+        epilog=below_options(program, (), EXAMPLES),
+        formatter_class=_Help,
         exit_on_error=False,
         allow_abbrev=False,
     )
@@ -65,11 +82,14 @@ def make_parser() -> ArgumentParser:
     return parser
 
 
-def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
+def parse(
+    arguments: Sequence[str] | None = None, program: str = PROGRAM
+) -> tuple[Config, Namespace]:
     """Read the settings from the command line and the files that it names.
 
     Args:
         arguments: of the command line.
+        program: the command's name, for its help.
 
     Returns:
         The checked settings, and the options before they were checked.
@@ -78,7 +98,7 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Config, Namespace]:
         ConfigError: for an unknown key, a wrong type or an impossible value.
     """
     words = list(_with_paths(sys.argv[1:] if arguments is None else arguments))
-    parser = make_parser()
+    parser = make_parser(program)
     for option, source in check_words(words, ["config", *sections()]):
         check_source(source, option)
     with _explained(parser):
@@ -376,6 +396,6 @@ def explain(parser: ArgumentParser, message: str) -> str:
         section = section.rpartition(".")[0]
     prefix = f"{section}." if section else ""
     valid = {n[len(prefix) :].partition(".")[0] for n in every_key if n.startswith(prefix)}
-    guess = renamed.did_you_mean(renamed.nearest(key, every_key))
+    guess = renamed.did_you_mean(renamed.nearest(key, [*every_key, "config", "resume"]))
     where = f" in {section}" if section else ""
     return f"unknown key {shown(key)}{guess} Keys{where}: {', '.join(sorted(valid))}"

@@ -21,6 +21,7 @@ from marl_pack.checks import real_number, shown, truth_value
 from marl_pack.geometry import ALL_ORIENTATIONS, check_size
 from marl_pack.stability import RULES, Rule, make_rule
 from marl_pack.stability.parameters import NO_OFFSET, THRESHOLDS, check_com_offset
+from marl_pack.stability.rules import unknown_rule
 
 T = TypeVar("T")
 NOTHING_TAKEN: Mapping[str, str] = MappingProxyType({})
@@ -50,7 +51,7 @@ def _option(
 def _rule(value: Any) -> Any:
     if callable(value) or (isinstance(value, str) and value in RULES):
         return value
-    raise ValueError(f"unknown stability rule {shown(value)}: one of {', '.join(RULES)}")
+    raise unknown_rule(value)
 
 
 MOST_ITEMS = 2**31 - 1
@@ -145,7 +146,7 @@ class GameSpec:
     rule: Any = _option(  # noqa: RUF009  # the default is a name
         "hull_alpha",
         f"stability rule of the masks, one of {', '.join(RULES)} (in Python also a function).",
-        _rule, lambda rule: f"rule {_rule_name(rule)}", choices=list(RULES),
+        _rule, lambda rule: f"rule {_rule_name(rule)}", choices=list(RULES), metavar="RULE",
     )  # fmt: skip
     margin: float | None = _option(
         None, "cells by which the support polygon is shrunk, 0 or more; null for none.", _margin,
@@ -155,6 +156,7 @@ class GameSpec:
         None,
         f"thresholds of the rule area_ratio, {' or '.join(THRESHOLDS)}; null for its default.",
         _thresholds, lambda thresholds: f"thresholds {thresholds}", choices=list(THRESHOLDS),
+        metavar="NAME",
     )  # fmt: skip
     orientations: tuple[int, ...] = _option(
         ALL_ORIENTATIONS, "indices of the orientations that may be chosen, of 0 to 5.",
@@ -319,7 +321,7 @@ def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) ->
     return signature.replace(parameters=[*own, *options])
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse._ActionsContainer) -> None:
     """Add every option to a command by its name, with the default None."""
     for option in fields(GameSpec):
         argument = dict(option.metadata["argument"])

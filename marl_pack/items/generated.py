@@ -1,7 +1,21 @@
 """The item streams that need no file: their names, and the sides of their items."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
+from marl_pack import renamed
+
 GENERATED = ("rs", "cut1", "cut2")
 """Names of the streams that need no file."""
 
 DEFAULT_SIDES = (2, 5)
 """Shortest and longest side of a generated item: the 64 types {2..5}³ of RS and CUT."""
+
+
+def no_such_file(items: str | Path) -> FileNotFoundError:
+    """Return the error that items are neither generated nor in a file; it says what was meant."""
+    guess = renamed.guess(str(items), GENERATED)
+    return FileNotFoundError(
+        f"{items}: no such file; items are {', '.join(GENERATED)} or a file{guess}"
+    )

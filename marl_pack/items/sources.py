@@ -14,7 +14,7 @@ from marl_pack.geometry import Size, check_size
 from marl_pack.items.checking import check_items
 from marl_pack.items.cutting import check_sides, cut
 from marl_pack.items.files import check_fields, read_fields
-from marl_pack.items.generated import DEFAULT_SIDES, GENERATED
+from marl_pack.items.generated import DEFAULT_SIDES, GENERATED, no_such_file
 from marl_pack.items.items import Items
 from marl_pack.items.sequences import Sequences
 from marl_pack.items.streams import Cut, Stream, Uniform
@@ -49,7 +49,7 @@ def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; items are {', '.join(GENERATED)} or a file")
+        raise no_such_file(path)
     return _from_fields(read_fields(path), size, str(path))
 
 

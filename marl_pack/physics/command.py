@@ -288,7 +288,12 @@ def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console
     """Write the picture or film of one stack."""
     from marl_pack.physics import film  # needs a renderer, which nothing else does
 
-    frame = film.render(stack, options.render, title, options.physics)
+    with make_progress(console) as bar:
+        task = bar.add_task("film: boxes", total=len(stack))
+        frame = film.render(
+            stack, options.render, title, options.physics,
+            lambda boxes: bar.update(task, completed=boxes),
+        )  # fmt: skip
     state = f"box {', '.join(map(str, frame.moved))} moved" if frame.moved else "nothing moved"
     console.print(f"{options.render}: all boxes and walls collide; {state}", soft_wrap=True)
 
@@ -296,30 +301,41 @@ def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console
 # --- the command ----------------------------------------------------------------------------------
 
 
-def parser() -> Parser:
+def parser(program: str = PROGRAM) -> Parser:
     """Return the parser of the command's options."""
     options = Parser(
-        prog=PROGRAM,
+        prog=program,
         description="Judge stacks in physics (SAPIEN, on the CPU).",
+        examples=(
+            "stack plans.npz",
+            "stack plans.npz --episodes 3 --render film.mp4",
+            "controls",
+            "table1 --objects 3000 --processes 2",
+        ),
     )
     commands = options.add_subparsers(dest="command", required=True)
     shared = Parser(add_help=False)
-    add = shared.add_argument
+    add = shared.add_argument_group("physics").add_argument
     add("--friction", type=float, default=DEFAULT.friction,
         help=f"between all faces (default: {DEFAULT.friction})")  # fmt: skip
     add("--everything", action="store_true",
         help="let all boxes and the walls collide, as in a real bin: neighbours then prop up what "
              "would fall")  # fmt: skip
+    add = shared.add_argument_group("output").add_argument
     add("--json", type=Path, metavar="FILE", help="write the figures there")
     several = Parser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     hint = f"that work at once (default: 1; here are {cores} cores)"
-    several.add_argument("--processes", type=int, default=1, help=hint)
+    several.add_argument_group("computation").add_argument(
+        "--processes", type=int, default=1, help=hint
+    )
 
     first = commands.add_parser(
-        "table1", parents=[shared, several], help="the paper's Table 1", description=table1.__doc__
-    )
-    add = first.add_argument
+        "table1", parents=[shared, several], help="the paper's Table 1",
+        description=table1.__doc__,
+        examples=("--objects 300", "--rules hull_1 hull_alpha lbcp --json table1.json"),
+    )  # fmt: skip
+    add = first.add_argument_group("objects").add_argument
     add("--rules", nargs="+", choices=list(RULES), default=["hull_1", "hull_alpha"],
         help="stability rules (default: the paper's two)")  # fmt: skip
     add("--objects", type=int, default=3000, help="placed under each rule (default: 3000)")
@@ -330,26 +346,30 @@ def parser() -> Parser:
 
     commands.add_parser(
         "controls", parents=[shared], help="stacks with a known verdict",
-        description=controls.__doc__,
+        description=controls.__doc__, examples=("--json controls.json",),
     )  # fmt: skip
 
     stack = commands.add_parser(
         "stack", parents=[shared, several], help="packings saved by evaluate --save-stacks",
         description="Judge saved packings after each of their placements.",
+        examples=("plans.npz --processes 2", "plans.csv --episodes 3 --render film.mp4"),
     )  # fmt: skip
-    add = stack.add_argument
-    add("file", type=Path, help="from python -m marl_pack.evaluate --save-stacks")
-    add("--episodes", nargs="+", type=int, metavar="K", help="which of them (default: all)")
-    add_body_options(stack)
-    add("--seed", type=int, default=0, help="of drawn bodies (default: 0)")
+    stack.add_argument("file", type=Path, help="of evaluate --save-stacks or play --save")
+    stack.add_argument(
+        "--episodes", nargs="+", type=int, metavar="K", help="which of them (default: all)"
+    )
+    bodies = stack.add_argument_group("bodies")
+    add_body_options(bodies)
+    bodies.add_argument("--seed", type=int, default=0, help="of drawn bodies (default: 0)")
+    add = stack.add_argument_group("film").add_argument
     add("--render", type=Path, metavar="FILE",
         help="show the stack being built: a film (.mp4, .gif) or its end (.png)")  # fmt: skip
     return options
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """Run the command ``python -m marl_pack.sapien_check``; return its exit status."""
-    options = parser().parse_args(arguments)
+    options = parser(program).parse_args(arguments)
     console = make_console()
     try:
         for name, low, high in (("processes", 1, MOST_AT_ONCE), ("seed", 0, LARGEST_SEED)):
@@ -366,12 +386,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             run_stack(options, console)
     except SimulationError as error:
-        complain(PROGRAM, f"no verdict: {error}")
+        complain(program, f"no verdict: {error}")
         return 1
     except KeyboardInterrupt:
-        complain(PROGRAM, "interrupted")
+        complain(program, "interrupted")
         return 130
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        complain(PROGRAM, error)
+        complain(program, error)
         return 2
     return 0

@@ -6,7 +6,7 @@ real bin. Drawn by PyVista (VTK), which needs neither a GPU nor a display.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -153,8 +153,21 @@ def check_path(path: Path) -> None:
     check_writable(path)
 
 
-def render(stack: Stack, path: Path, title: str = "", physics: Physics = DEFAULT) -> Frame:
+def render(
+    stack: Stack,
+    path: Path,
+    title: str = "",
+    physics: Physics = DEFAULT,
+    progress: Callable[[int], object] = lambda boxes: None,
+) -> Frame:
     """Write a film of the stack being built (.mp4, .gif), or a picture of its end (.png).
+
+    Args:
+        stack: to build.
+        path: of the film or picture.
+        title: written above.
+        physics: in which it is built.
+        progress: called with the number of boxes that stand.
 
     Returns:
         The last frame.
@@ -169,7 +182,8 @@ def render(stack: Stack, path: Path, title: str = "", physics: Physics = DEFAULT
     try:
         with moved_into_place(path) as part:
             if path.suffix.lower() == ".png":
-                *_, frame = simulate(stack, physics)
+                for frame in simulate(stack, physics):
+                    progress(len(frame.middles))
                 imageio.imwrite(part, view.picture(frame))
                 return frame
             options: dict[str, Any] = {"fps": FPS}
@@ -179,6 +193,7 @@ def render(stack: Stack, path: Path, title: str = "", physics: Physics = DEFAULT
             with writer as film:
                 for frame in simulate(stack, physics):
                     film.append_data(view.picture(frame))
+                    progress(len(frame.middles))
             return frame
     finally:
         view.close()

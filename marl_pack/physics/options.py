@@ -10,7 +10,7 @@ BODY_OPTIONS = ("cell", "density", "com_spread")
 """Names of the options that :func:`add_body_options` adds; each is None unless it is given."""
 
 
-def add_body_options(parser: argparse.ArgumentParser) -> None:
+def add_body_options(parser: argparse._ActionsContainer) -> None:
     """Add ``--cell``, ``--density`` and ``--com-spread`` to a command."""
     add = parser.add_argument
     add("--cell", type=float, metavar="METRES",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from marl_pack import renamed
 from marl_pack.checks import real_number, shown
 from marl_pack.geometry import MAX_SIDE
 from marl_pack.stability.parameters import Thresholds, check_thresholds
@@ -153,6 +154,12 @@ RULES: dict[str, Callable[..., Tensor]] = {
 """Every stability rule by its name."""
 
 
+def unknown_rule(name: object) -> ValueError:
+    """Return the error that there is no such rule; it says which one was probably meant."""
+    guess = renamed.guess(name, RULES) if isinstance(name, str) else ""
+    return ValueError(f"unknown stability rule {shown(name)}: one of {', '.join(RULES)}{guess}")
+
+
 def make_rule(name: str, **parameters: object) -> Rule:
     """Return the rule called ``name`` with its parameters bound.
 
@@ -160,7 +167,7 @@ def make_rule(name: str, **parameters: object) -> Rule:
         ValueError: for an unknown rule, an unknown parameter or a negative margin.
     """
     if not isinstance(name, str) or name not in RULES:
-        raise ValueError(f"unknown stability rule {shown(name)}: one of {', '.join(RULES)}")
+        raise unknown_rule(name)
     accepted = list(inspect.signature(RULES[name]).parameters)[2:]
     for key in parameters:
         if key not in accepted:

@@ -65,6 +65,10 @@ class Display:
             learners.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
         return ["  ".join(figures), "  ".join(learners)]
 
+    def evaluating(self) -> None:
+        """Show that an evaluation is under way."""
+        self.text.plain += "\nevaluating on held-out sequences"
+
     def evaluated(self, row: Mapping[str, Any]) -> None:
         """Show the result of one evaluation."""
         bounds = None if row["low"] is None else (row["low"], row["high"])

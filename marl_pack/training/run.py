@@ -14,7 +14,7 @@ from rich.console import Console
 from marl_pack.agents.learning.runner import RunInterruptedError, Runner, TrainingDivergedError
 from marl_pack.agents.networks.distribution import NotFiniteError
 from marl_pack.config import Config, ConfigError
-from marl_pack.terminal import complain, make_console
+from marl_pack.terminal import announce_compiling, complain, make_console, make_status
 from marl_pack.training.assembly import evaluation, make_runner, rank
 from marl_pack.training.display import Display
 from marl_pack.training.folder import (
@@ -54,14 +54,20 @@ def train(
         write_history(folder / "evaluations.csv", history)
         display.evaluated(history[-1])
 
-    runner = make_runner(
-        config,
-        folder,
-        checkpoint,
-        evaluate=lambda current: evaluation(config, current),
-        show=display.show if rank() == 0 else lambda progress: None,
-        evaluated=evaluated,
-    )
+    def evaluate(current: Mapping[str, Any]) -> dict[str, Any]:
+        display.evaluating()
+        return evaluation(config, current)
+
+    announce_compiling(console)
+    with make_status(console, "setting up the games and the networks"):
+        runner = make_runner(
+            config,
+            folder,
+            checkpoint,
+            evaluate=evaluate,
+            show=display.show if rank() == 0 else lambda progress: None,
+            evaluated=evaluated,
+        )
     if rank() == 0:
         write_record(folder, config, arguments)
 
@@ -135,7 +141,7 @@ def start(
     if rank() == 0:
         console.print(
             f"done: {runner.logger.tot_timesteps:,} items; play it with "
-            f"python -m marl_pack.evaluate --policy {folder}",
+            f"{program.removesuffix('train')}evaluate --policy {folder}",
             soft_wrap=True,
         )
     return 0

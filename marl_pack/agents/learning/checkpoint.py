@@ -31,7 +31,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learning import migration
 from marl_pack.agents.learning.form import (
@@ -44,13 +43,15 @@ from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, ORIENTATION, PLACEMENT
 from marl_pack.agents.networks.planes import need_critic
 from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.sources import BEST as BEST
+from marl_pack.agents.sources import LATEST as LATEST
+from marl_pack.agents.sources import resolve as resolve
 from marl_pack.checks import described, shown, whole_number
 from marl_pack.files import write_atomically
 
 FORMAT = 2
 MOST_SHARED = 4
 """How often the same tensor may stand in a checkpoint, on average."""
-LATEST, BEST = "latest.pt", "best.pt"
 
 HEURISTICS = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
 """Heuristics that can play an agent, by the agent's name."""
@@ -91,28 +92,6 @@ Settings and networks check the values of their own fields.
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Write a checkpoint; if that fails, the file that was there stays."""
     write_atomically(path, lambda file: torch.save(dict(checkpoint), file))
-
-
-def resolve(source: str | Path) -> Path:
-    """Return the checkpoint file that ``source`` names.
-
-    Args:
-        source: a published model's name, or the path of a checkpoint or of a run's folder: there
-            its best, else its latest.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: for a name that is none of a published model.
-    """
-    path = published.model(source)
-    if path.is_dir():
-        for name in (BEST, LATEST):
-            if (path / name).is_file():
-                return path / name
-        raise FileNotFoundError(f"{path}: needs {BEST} or {LATEST}, as a run's folder has")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
-    return path
 
 
 def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -54,8 +54,9 @@ class Network:
             renamed.refuse_old(plane, renamed.PLANES, "network: plane")
         unknown = [plane for plane in self.planes if plane not in PLANES]
         if unknown or len(set(self.planes)) < len(self.planes):
+            guess = renamed.guess(unknown[0], PLANES) if unknown else ""
             raise ValueError(
-                f"network: planes {shown(self.planes)}: any of {', '.join(PLANES)}, once"
+                f"network: planes {shown(self.planes)}: any of {', '.join(PLANES)}, once{guess}"
             )
 
 
