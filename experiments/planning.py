@@ -20,7 +20,7 @@ from experiments.rows import Rows, main_of, mean
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.policy import Policy
-from marl_pack.agents.search import SearchSettings
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream

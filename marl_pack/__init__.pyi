@@ -4,7 +4,7 @@ from .agents.keys import POLICIES as POLICIES
 from .agents.player import Player as Player
 from .agents.player import load as load
 from .agents.policy import Policy as Policy
-from .agents.search import SearchSettings as SearchSettings
+from .agents.search_settings import SearchSettings as SearchSettings
 from .bins import Bins as Bins
 from .env_aec import env as env
 from .env_aec import parallel_env as parallel_env

@@ -18,7 +18,7 @@ COMMANDS = {
     "train": ("marl_pack.train", "train the two agents, or resume a run"),
     "evaluate": ("marl_pack.evaluate", "play many games; print and save how full the bins are"),
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),
-    "export": ("marl_pack.export", "write trained agents as ONNX, or for rsl_rl"),
+    "export": ("marl_pack.export.command", "write trained agents as ONNX, or for rsl_rl"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),
 }
 """The module of each command, whose ``main`` runs it, and what it does."""

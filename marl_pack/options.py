@@ -7,6 +7,7 @@ from pathlib import Path
 
 from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.agents.sources import path_of, resolve
 from marl_pack.game.spec import add_arguments
 from marl_pack.items import GENERATED
@@ -54,7 +55,7 @@ def add_options(options: argparse.ArgumentParser) -> None:
 
 
 def check_names(arguments: argparse.Namespace) -> None:
-    """Refuse players and items that do not exist.
+    """Refuse players and items that do not exist, and searches that cannot be read.
 
     What plays is slow to import, so commands call this first.
 
@@ -66,6 +67,8 @@ def check_names(arguments: argparse.Namespace) -> None:
     for name, names in players:
         if name is not None and name not in names:
             resolve(path_of(name, names))
+    if arguments.plan is not None:
+        SearchSettings.parse(arguments.plan)
     items = arguments.items
     if items is not None and items not in GENERATED and not Path(items).is_file():
         raise no_such_file(items)

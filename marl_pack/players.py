@@ -171,7 +171,7 @@ def with_search(
     """
     from marl_pack.agents.learning import checkpoint as checkpoints
     from marl_pack.agents.loading import Loader, imagined_stream
-    from marl_pack.agents.search import SearchSettings
+    from marl_pack.agents.search_settings import SearchSettings
 
     settings = SearchSettings.parse(arguments.plan)
     if all(name in POLICIES for name in policies) or arguments.orientation is not None:

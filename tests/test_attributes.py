@@ -14,7 +14,7 @@ from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader
-from marl_pack.agents.search import SearchSettings
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.backend import Backend
 from marl_pack.config import parse
 from marl_pack.evaluate import main as evaluate

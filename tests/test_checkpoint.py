@@ -10,7 +10,7 @@ from small_runs import PLAIN, same
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader, load_actor, load_afterstate_critic, record_of
 from marl_pack.agents.policy import InTurns
-from marl_pack.agents.search import SearchSettings
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.config import from_dict
 from marl_pack.evaluate import main as evaluate
 from marl_pack.export import main as export

@@ -16,7 +16,7 @@ from marl_pack.evaluation.rollout import Rollout
 from marl_pack.evaluation.statistics import spread, strict_equilibrium, summary
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
-from marl_pack.plan_archive import load_plans
+from marl_pack.plan_archive import ENDINGS, load_plans
 from marl_pack.terminal import make_console
 
 
@@ -25,7 +25,9 @@ def test_the_table_the_json_and_the_stacks_agree(
 ) -> None:
     out, stacks = tmp_path / "out.json", tmp_path / "stacks.npz"
     arguments = ["--policy", "dblf", "--items", "rs", "--episodes", "40", "--seed", "3"]
+    assert evaluate.main([*arguments, "--save-stacks", str(tmp_path / "stacks.csv")]) == 0
     assert evaluate.main([*arguments, "--json", str(out), "--save-stacks", str(stacks)]) == 0
+    assert load_plans(tmp_path / "stacks.csv") == load_plans(stacks)
     report = json.loads(out.read_text())
     row = report["policies"]["dblf"]
     plans = load_plans(stacks)
@@ -272,9 +274,14 @@ def test_play_shows_the_game_and_draws_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "bin.png"
-    assert play_command.main(["--policy", "dblf", "--picture", str(path)]) == 0
+    saved = [tmp_path / f"plan{ending}" for ending in ENDINGS]
+    for plan in saved:
+        assert play_command.main(["--picture", str(path), "--save", str(plan)]) == 0
     text = capsys.readouterr().out
     assert "in strict equilibrium" in text
+    assert load_plans(saved[0]) == load_plans(saved[1]) == load_plans(saved[2])
+    assert f"{len(load_plans(saved[0])[0])} boxes" in text
+    assert Plan.from_json(tmp_path / "plan.json") == Plan.from_csv(tmp_path / "plan.csv")
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     for wrong, why in (
         (["--picture", "bin.xyz"], "ending .png"),

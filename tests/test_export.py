@@ -10,7 +10,6 @@ import pytest
 import torch
 from small_runs import PLAIN
 
-from marl_pack import export
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -19,7 +18,14 @@ from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.actor_critic import Actor, make_actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.agents.networks.planes import PLANES
-from marl_pack.export import Exported, example, export_afterstates, export_onnx, main
+from marl_pack.export import (
+    Exported,
+    example,
+    export_afterstates,
+    export_onnx,
+    main,
+    writers,
+)
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS
@@ -127,7 +133,7 @@ def test_the_command_writes_every_learned_agent(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(export, "export_agent", interrupt)
+        patch.setattr(writers, "export_agent", interrupt)
         main([str(tmp_path / "run")])
     assert end.value.code == 130
     assert capsys.readouterr().err == "python -m marl_pack.export: interrupted\n"

@@ -13,7 +13,8 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import make_actor
-from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.agents.search import Planner
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.backend import Backend
 from marl_pack.game import invariants
 from marl_pack.game.packing import Packing

@@ -17,7 +17,8 @@ from marl_pack.agents.heuristics import (
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.policy import InTurns, Policy
-from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.agents.search import Planner
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
 from marl_pack.items import Uniform, make_stream

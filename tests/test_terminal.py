@@ -1,11 +1,22 @@
 """Foreign text on the terminal: as it is, without markup and without control characters."""
 
 import io
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from rich.table import Table
 
-from marl_pack.terminal import Parser, complain, make_console, make_progress, printable
+from marl_pack.terminal import (
+    Parser,
+    complain,
+    make_console,
+    make_progress,
+    make_status,
+    printable,
+)
 
 NASTY = [
     "q[/z]",
@@ -42,6 +53,35 @@ def test_names_are_printed_as_they_are_everywhere(
     with pytest.raises(SystemExit):
         Parser(prog="program").exit(2, f"program: {text}\nsecond line")
     assert capsys.readouterr().err == f"program: {shown} second line\n" * 2
+
+
+def test_progress_is_shown_on_a_terminal_alone() -> None:
+    for terminal in (False, True):
+        output = io.StringIO()
+        console = make_console(file=output, force_terminal=terminal, width=80)
+        with make_status(console, "loading \x1b[31m"):
+            pass
+        with make_progress(console) as bar:
+            bar.add_task("episodes", total=1)
+            bar.refresh()
+        assert ("episodes" in output.getvalue()) == terminal
+        assert (printable("loading \x1b[31m") in output.getvalue()) == terminal
+
+
+def test_the_first_start_says_once_that_it_compiles(tmp_path: Path) -> None:
+    code = (
+        "import numpy\n"
+        "from marl_pack.terminal import announce_compiling, make_console\n"
+        "from marl_pack.items.random_numbers import draw\n"
+        "announce_compiling(make_console(force_terminal=True, width=200))\n"
+        "draw(numpy.array([1], numpy.uint64), 10)\n"
+    )
+    for times in (1, 0):
+        output = subprocess.check_output(
+            [sys.executable, "-c", code], text=True,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        )  # fmt: skip
+        assert output.count("compiling") == times
 
 
 def test_piped_tables_are_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -28,7 +29,8 @@ from marl_pack.agents.policy import (
     PlacementAgent,
     Policy,
 )
-from marl_pack.agents.search import Planner, SearchSettings
+from marl_pack.agents.search import Planner
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.agents.sources import path_of
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import Size

@@ -18,7 +18,7 @@ from marl_pack.env_aec import AGENTS, AtOnce, raw_env
 from marl_pack.game.packing import Packing
 
 if TYPE_CHECKING:
-    from marl_pack.agents.search import SearchSettings
+    from marl_pack.agents.search_settings import SearchSettings
 
 
 def load(
@@ -57,7 +57,7 @@ def load(
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
     from marl_pack.agents.loading import Loader, imagined_stream
-    from marl_pack.agents.search import SearchSettings
+    from marl_pack.agents.search_settings import SearchSettings
 
     loader = Loader(device, seed, symmetric)
     if search is None:

@@ -11,8 +11,6 @@ ordinary game with the same masks, so the search can choose only legal pairs.
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,7 +18,7 @@ from torch import Tensor
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import Critic
 from marl_pack.agents.policy import Placement
-from marl_pack.checks import whole_number
+from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS, oriented
@@ -28,53 +26,6 @@ from marl_pack.items import Stream
 
 AT_ONCE = 1 << 19
 """Number of cells, about, on the floors of all imagined games that are played at once."""
-MOST = 1 << 20
-"""Largest number of futures of one decision."""
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """The number of pairs and futures that a search tries, and their depth.
-
-    Args:
-        rollouts: imagined futures K for each pair, on average.
-        top: pairs M to be tried.
-        depth: items to be placed in each future before the orientation agent's critic values what
-            may still come; None plays every future to its end.
-    """
-
-    rollouts: int = 16
-    top: int = 8
-    depth: int | None = None
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (value is None and name == "depth"):
-                object.__setattr__(self, name, whole_number(value, f"plan: {name}", 1))
-        if self.rollouts * self.top > MOST:
-            raise ValueError(f"plan: rollouts · top = {self.rollouts * self.top}, at most {MOST:,}")
-
-    def __str__(self) -> str:
-        named = (f"{k}={v}" for k, v in vars(self).items() if v is not None)
-        return f"plan {','.join(named)}"
-
-    @classmethod
-    def parse(cls, text: str) -> SearchSettings:
-        """Read settings such as ``"rollouts=16,top=8,depth=3"``; missing ones have their defaults.
-
-        Raises:
-            ValueError: if the text has another form; says what would be right.
-        """
-        values = {}
-        for part in text.split(","):
-            key, _, value = part.partition("=")
-            key, value = key.strip(), value.strip()
-            if key not in cls.__dataclass_fields__ or not re.fullmatch("[0-9]{1,9}", value):
-                raise ValueError(f"plan {text!r}: {part!r}: needs rollouts=K, top=M or depth=D")
-            if key in values:
-                raise ValueError(f"plan {text!r}: {key} is given twice")
-            values[key] = int(value)
-        return cls(**values)
 
 
 class Planner:

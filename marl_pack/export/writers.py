@@ -1,17 +1,13 @@
-"""Write a checkpoint's agents for use elsewhere: ONNX, rsl_rl's own format, or to publish them.
+"""Write networks as ONNX files, and agents for rsl_rl or to publish them.
 
-``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
-the checkpoint, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates. Batch and
-bin size are free. The masks are inputs and are applied inside: an illegal action has probability 0
-and is never the best. Each file's metadata says what its inputs are and what it was trained on
-(``docs/onnx.md``).
+Batch and bin size of an ONNX file are free. The masks are inputs and are applied inside: an illegal
+action has probability 0 and is never the best. Each file's metadata says what its inputs are and
+what it was trained on (``docs/onnx.md``).
 """
 
 from __future__ import annotations
 
 import json
-import logging
-import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -38,11 +34,10 @@ from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES, Meaning
 from marl_pack.config import from_dict
-from marl_pack.extras import missing
 from marl_pack.files import write_atomically
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.terminal import Parser, make_console
+from marl_pack.terminal import make_status
 from marl_pack.training.assembly import runner_settings
 
 OPSET = 18
@@ -287,7 +282,9 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
         if form == "rsl_rl" and learned and "optimizer_state_dict" not in agent:
             state = fresh_optimizer(checkpoint, name)
             agent = {**agent, "optimizer_state_dict": state}
-        console.print(export_agent(agent, name, folder, form, training), soft_wrap=True)
+        with make_status(console, f"exporting {name}"):
+            line = export_agent(agent, name, folder, form, training)
+        console.print(line, soft_wrap=True)
         own = load_afterstate_critic(agent, "cpu")
         if own is not None and form == "onnx":  # a frozen agent's, of another run
             export_afterstates(own, folder / f"{name}_afterstate_critic.onnx", training)
@@ -296,33 +293,3 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
         path = folder / "afterstate_critic.onnx"
         export_afterstates(critic, path, training)
         console.print(f"{path}: features of an afterstate to its value", soft_wrap=True)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command ``python -m marl_pack.export``; return its exit status."""
-    options = Parser(prog="python -m marl_pack.export", description=__doc__.split("\n\n")[0])
-    options.add_argument("checkpoint", help="a published model, a checkpoint or a run's folder")
-    options.add_argument(
-        "--format", choices=["onnx", "rsl_rl", "checkpoint"], default="onnx",
-        help="ONNX (default), the state that a stock rsl_rl PPO loads, or a checkpoint to publish: "
-        "without what only the rest of its run needs",
-    )  # fmt: skip
-    options.add_argument(
-        "--folder", type=Path,
-        help="to write to (default: beside the checkpoint; ./NAME for a published model)",
-    )  # fmt: skip
-    chosen = options.parse_args(arguments)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    try:
-        run(chosen.checkpoint, chosen.folder, chosen.format, make_console())
-    except KeyboardInterrupt:
-        options.exit(130, f"{options.prog}: interrupted")
-    except ModuleNotFoundError as error:
-        options.exit(2, f"{options.prog}: {missing(error, 'ONNX needs two packages', 'export')}")
-    except (ValueError, OSError) as error:
-        options.exit(2, f"{options.prog}: {error}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,56 @@
+"""The settings of the search at decision time, as ``--plan`` gives them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from marl_pack.checks import whole_number
+
+MOST = 1 << 20
+"""Largest number of futures of one decision."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The number of pairs and futures that a search tries, and their depth.
+
+    Args:
+        rollouts: imagined futures K for each pair, on average.
+        top: pairs M to be tried.
+        depth: items to be placed in each future before the orientation agent's critic values what
+            may still come; None plays every future to its end.
+    """
+
+    rollouts: int = 16
+    top: int = 8
+    depth: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (value is None and name == "depth"):
+                object.__setattr__(self, name, whole_number(value, f"plan: {name}", 1))
+        if self.rollouts * self.top > MOST:
+            raise ValueError(f"plan: rollouts · top = {self.rollouts * self.top}, at most {MOST:,}")
+
+    def __str__(self) -> str:
+        named = (f"{k}={v}" for k, v in vars(self).items() if v is not None)
+        return f"plan {','.join(named)}"
+
+    @classmethod
+    def parse(cls, text: str) -> SearchSettings:
+        """Read settings such as ``"rollouts=16,top=8,depth=3"``; missing ones have their defaults.
+
+        Raises:
+            ValueError: if the text has another form; says what would be right.
+        """
+        values = {}
+        for part in text.split(","):
+            key, _, value = part.partition("=")
+            key, value = key.strip(), value.strip()
+            if key not in cls.__dataclass_fields__ or not re.fullmatch("[0-9]{1,9}", value):
+                raise ValueError(f"plan {text!r}: {part!r}: needs rollouts=K, top=M or depth=D")
+            if key in values:
+                raise ValueError(f"plan {text!r}: {key} is given twice")
+            values[key] = int(value)
+        return cls(**values)
