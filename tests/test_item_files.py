@@ -27,16 +27,9 @@ def read_items(path: Path) -> None:
     assert (items.weights > 0).all()
 
 
-def read_plan(path: Path) -> None:
-    readers: dict[str, Callable[[Path], Any]] = {
-        ".json": Plan.from_json, ".csv": Plan.from_csv, ".npz": load_plans,
-    }  # fmt: skip
-    readers[path.suffix](path)
-
-
 @pytest.mark.parametrize("plans", [False, True])
 def test_a_bad_file_is_refused_in_one_line_that_names_it(plans: bool, tmp_path: Path) -> None:
-    read = read_plan if plans else read_items
+    read = load_plans if plans else read_items
     for name, content, suffix in item_files.good_files(plans):
         path = tmp_path / f"{name}{suffix}"
         path.write_bytes(content)

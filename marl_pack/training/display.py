@@ -31,6 +31,7 @@ class Display:
             TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=console,
         )  # fmt: skip
         self.text = Text()
+        self.figures = ""  # of the last iteration
         self.view = Live(Group(self.bar, self.text), console=console, refresh_per_second=2)
         self.task = self.bar.add_task("", total=total, completed=done)
         self.shown_at = 0.0
@@ -39,7 +40,7 @@ class Display:
         """Show the figures of one iteration."""
         lines = self.lines(progress)
         self.bar.update(self.task, completed=progress.iteration)
-        self.text.plain = "\n".join(lines)
+        self.text.plain = self.figures = "\n".join(lines)
         now = time.monotonic()
         final = progress.iteration == self.total
         if not self.live and (final or now - self.shown_at > QUIET_SECONDS):
@@ -67,10 +68,11 @@ class Display:
 
     def evaluating(self) -> None:
         """Show that an evaluation is under way."""
-        self.text.plain += "\nevaluating on held-out sequences"
+        self.text.plain = f"{self.figures}\nevaluating on held-out sequences"
 
     def evaluated(self, row: Mapping[str, Any]) -> None:
         """Show the result of one evaluation."""
+        self.text.plain = self.figures
         bounds = None if row["low"] is None else (row["low"], row["high"])
         self.console.print(
             f"evaluation after {row['iteration']} iterations, {row['items']:,} items, "

@@ -211,8 +211,14 @@ def _as_csv(plan: dict[str, Any]) -> bytes:
 def good_files(plans: bool) -> list[Case]:
     """Return files that are right."""
     if plans:
+        text = {"policy": "dblf", "plans": [{"episode": k} | PLAN for k in (0, 1)]}
+        header, *lines = _as_csv(PLAN).decode().splitlines()
+        rows = [f"dblf,{k},{line}" for k in (0, 1) for line in lines]
+        table = "\n".join([f"policy,episode,{header}", *rows])
         return [("plan", json.dumps(PLAN).encode(), ".json"), ("plan", _as_csv(PLAN), ".csv"),
-                ("plan", archive(**plan_arrays()), ".npz")]  # fmt: skip
+                ("plans", json.dumps(text).encode(), ".json"),
+                ("plans", table.encode(), ".csv"),
+                ("plans", archive(**plan_arrays()), ".npz")]  # fmt: skip
     arrays = {"items": [[2, 3, 4], [5, 5, 5]], "weights": [1.5, 2.0], "ids": ["red", "7"]}
     return [("items", json.dumps(GOODS).encode(), ".json"), ("items", TABLE.encode(), ".csv"),
             ("items", archive(**arrays), ".npz")]  # fmt: skip

@@ -96,13 +96,9 @@ def item_files(seed: int, folder: Path) -> Iterator[Case]:
 
 def plan_files(seed: int, folder: Path) -> Iterator[Case]:
     """Yield files of plans, as JSON, CSV and npz."""
-    from marl_pack.plan import Plan
     from marl_pack.plan_archive import load_plans
 
-    readers: dict[str, Callable[[Path], Any]] = {
-        ".json": Plan.from_json, ".csv": Plan.from_csv, ".npz": load_plans,
-    }  # fmt: skip
-    yield from _files(seed, folder, lambda path: readers[path.suffix](path), plans=True)
+    yield from _files(seed, folder, load_plans, plans=True)
 
 
 def _files(seed: int, folder: Path, read: Callable[[Path], Any], plans: bool) -> Iterator[Case]:
