@@ -126,7 +126,7 @@ def packed(setup: Setup, episodes: int, bar: Progress) -> tuple[dict[str, Any], 
         balanced[e] = strict_equilibrium(plan)
         bar.advance(solving)
     figures = summary(rollout, balanced)
-    figures["cpu_seconds"] = seconds  # of the game and the policy
+    figures["cpu_seconds"] = seconds  # of the game and the policy, loading code included
     del figures["decisions_per_second"]  # by the clock
     return figures, rollout.plans
 
