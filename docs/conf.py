@@ -8,7 +8,7 @@ author = copyright = "the authors of marl_pack"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 root_doc = "docs/contents"
-include_patterns = ["*.md", "docs/*.md", "docs/*.rst", "models/*.md"]
+include_patterns = ["*.md", "docs/*.md", "docs/notes/*.md", "docs/*.rst", "models/*.md"]
 myst_heading_anchors = 4
 suppress_warnings = ["myst.xref_missing"]  # links to folders; tests/test_pages.py follows all links
 
