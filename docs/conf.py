@@ -10,7 +10,10 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 root_doc = "docs/contents"
 include_patterns = ["*.md", "docs/*.md", "docs/notes/*.md", "docs/*.rst", "models/*.md"]
 myst_heading_anchors = 4
-suppress_warnings = ["myst.xref_missing"]  # links to folders; tests/test_pages.py follows all links
+suppress_warnings = [
+    "myst.xref_missing",  # links to folders; tests/test_pages.py follows all links
+    "ref.python",  # an attribute of two classes
+]
 
 napoleon_use_ivar = True  # attributes that are properties too are described once
 autodoc_member_order = "bysource"

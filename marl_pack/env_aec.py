@@ -218,7 +218,8 @@ def parallel_env(
 
     Args:
         simultaneous: see above.
-        illegal_reward, **options: as :func:`env` takes them.
+        illegal_reward: as :func:`env` takes it.
+        **options: as :func:`env` takes them.
 
     Raises:
         ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
