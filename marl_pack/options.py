@@ -8,7 +8,7 @@ from pathlib import Path
 from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.search_settings import SearchSettings
-from marl_pack.agents.sources import path_of, resolve
+from marl_pack.agents.sources import check_source, path_of, resolve
 from marl_pack.game.spec import add_arguments
 from marl_pack.items import GENERATED
 from marl_pack.items.generated import no_such_file
@@ -27,7 +27,8 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add = options.add_argument_group("players").add_argument
     add("--policy", nargs="+", metavar="NAME",
         help=f"one or more of the heuristics {', '.join(POLICIES)}, of the published models "
-             f"{models}, or {learned} (default: dblf)")  # fmt: skip
+             f"{models}, {learned}, or a function of your own, FILE.py:NAME "
+             "(default: dblf)")  # fmt: skip
     add("--orientation", metavar="NAME",
         help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, "
              f"{models}, or {learned}")  # fmt: skip
@@ -62,9 +63,12 @@ def check_names(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError, FileNotFoundError: naming what would be right.
     """
-    players = [(name, POLICIES) for name in arguments.policy or ()]
-    players += [(arguments.orientation, ORIENTATION_AGENTS), (arguments.placement, POLICIES)]
-    for name, names in players:
+    for name in arguments.policy or ():
+        check_source(name, POLICIES)
+    for name, names in (
+        (arguments.orientation, ORIENTATION_AGENTS),
+        (arguments.placement, POLICIES),
+    ):
         if name is not None and name not in names:
             resolve(path_of(name, names))
     if arguments.plan is not None:

@@ -1,7 +1,8 @@
 """Play one game, turn by turn, and draw the packed bin.
 
 ``python -m marl_pack.play --policy rs --picture play.png`` prints each item, its orientation and
-its place, then writes a picture of the bin at the end. ``--save`` writes the plan of the bin.
+its place, then writes a picture of the bin at the end, or with the ending ``.gif`` an animation of
+how it was packed. ``--save`` writes the plan of the bin.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def parser(program: str = PROGRAM) -> Parser:
         prog=program, usage=f"{program} [OPTIONS]",
         description=__doc__.split("\n\n")[0], notes=[GAME_NOTE],
         examples=(
-            "--policy rs --picture bin.png",
+            "--policy rs --picture bin.gif",
             "--policy runs/NAME --items boxes.csv --episode 3 --save plan.json",
         ),
     )  # fmt: skip
@@ -41,7 +42,8 @@ def parser(program: str = PROGRAM) -> Parser:
     )
     add = options.add_argument_group("output").add_argument
     add("--picture", type=Path, default=Path("play.png"),
-        help="where to draw the bin (default: play.png)")  # fmt: skip
+        help="where to draw the packed bin (.png), or how it was packed (.gif) "
+             "(default: play.png)")  # fmt: skip
     add("--save", type=Path, metavar="FILE",
         help="write the packed boxes there (.json, .csv or .npz)")  # fmt: skip
     return options
@@ -53,8 +55,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
-    if chosen.picture.suffix.lower() != ".png":
-        raise ValueError(f"--picture {chosen.picture}: needs the ending .png")
+    if chosen.picture.suffix.lower() not in (".png", ".gif"):
+        raise ValueError(f"--picture {chosen.picture}: needs the ending .png or .gif")
     check_writable(chosen.picture)
     if chosen.save is not None:
         check_ending(chosen.save, "--save")
@@ -99,6 +101,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
     from matplotlib.image import imsave
 
+    from marl_pack.render.animation import save_gif
     from marl_pack.render.picture import draw
 
     plan = Plan.from_bins(game.bins.to("cpu"), 0)
@@ -106,8 +109,11 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)
     with make_status(console, "drawing the bin"):
-        image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
-        write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
+        if chosen.picture.suffix.lower() == ".gif":
+            save_gif(chosen.picture, plan, name)
+        else:
+            image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
+            write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
     console.print(f"picture: {chosen.picture}", soft_wrap=True)
     if chosen.save is not None:
         save_plan(chosen.save, plan)

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import InTurns, Policy
+from marl_pack.agents.sources import is_own
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.game.packing import Packing
@@ -108,10 +109,11 @@ def choose_game(
         learned = learned | {"margin": None, "thresholds": None}
     items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
     low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
-    size = chosen.get("bin")
-    if size is None and (arguments.items is None or items in GENERATED):
-        size = learned.get("bin")
-    stream, bin_size = choose_stream(items, tuple(size) if size else None, (low, high))
+    size, before = chosen.get("bin"), learned.get("bin")
+    if size is None and arguments.items is None:
+        size = before
+    size, before = (tuple(sides) if sides else None for sides in (size, before))
+    stream, bin_size = choose_stream(items, size, (low, high), before)
     spec = GameSpec.of(learned | chosen | {"bin": bin_size})
     return stream, items, (low, high), spec
 
@@ -132,7 +134,8 @@ def choose_policies(
         raise ValueError("--orientation and --placement go together: name both agents")
     names = arguments.policy or ([] if pair[0] else ["dblf"])
     sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
-    if arguments.symmetric and all(name in ORIENTATION_AGENTS for name in sources):
+    learned_sources = [s for s in sources if s not in ORIENTATION_AGENTS and not is_own(s)]
+    if arguments.symmetric and not learned_sources:
         raise ValueError("--symmetric: needs a run's folder or checkpoint")
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
@@ -146,15 +149,14 @@ def choose_policies(
             loader.orientation_agent(pair[0]), loader.placement_agent(pair[1])
         )
     learned: dict[str, Any] = {}
-    for source in sources:
-        if source not in ORIENTATION_AGENTS:
-            checkpoint = checkpoints.read(source)
-            try:
-                learned = learned or trained_game(checkpoint)
-                description = trained_on(checkpoint)
-            except ValueError as error:
-                raise ValueError(f"{source}: {error}") from None
-            console.print(f"{source}: trained on {description}", soft_wrap=True)
+    for source in learned_sources:
+        checkpoint = checkpoints.read(source)
+        try:
+            learned = learned or trained_game(checkpoint)
+            description = trained_on(checkpoint)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+        console.print(f"{source}: trained on {description}", soft_wrap=True)
     return policies, learned
 
 
@@ -174,11 +176,12 @@ def with_search(
     from marl_pack.agents.search_settings import SearchSettings
 
     settings = SearchSettings.parse(arguments.plan)
-    if all(name in POLICIES for name in policies) or arguments.orientation is not None:
+    fixed = [name for name in policies if name in POLICIES or is_own(name)]
+    if len(fixed) == len(policies) or arguments.orientation is not None:
         raise ValueError("--plan: needs --policy with a run's folder or checkpoint")
     policies_with_search: dict[str, Policy] = {}
     for name, policy in policies.items():
-        if name in POLICIES:
+        if name in fixed:
             policies_with_search[name] = policy
             continue
         checkpoint = checkpoints.read(name, arguments.device)

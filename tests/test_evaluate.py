@@ -283,8 +283,11 @@ def test_play_shows_the_game_and_draws_it(
     assert f"{len(load_plans(saved[0])[0])} boxes" in text
     assert Plan.from_json(tmp_path / "plan.json") == Plan.from_csv(tmp_path / "plan.csv")
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    film = tmp_path / "bin.gif"
+    assert play_command.main(["--picture", str(film)]) == 0
+    assert film.read_bytes()[:6] == b"GIF89a"
     for wrong, why in (
-        (["--picture", "bin.xyz"], "ending .png"),
+        (["--picture", "bin.xyz"], "ending .png or .gif"),
         (["--policy", "dblf", "random", "--picture", str(path)], "needs one policy"),
         (["--episode", "-1", "--picture", str(path)], "needs 0"),
     ):
@@ -305,3 +308,38 @@ def test_play_shows_where_a_choice_without_a_cell_ends_the_game(
     text = capsys.readouterr().out
     assert "nowhere" in text
     assert "1 boxes" in text
+
+
+def test_a_policy_of_ones_own_is_measured_beside_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(
+        "from marl_pack import load\ndblf = load('dblf')\nnumber = 3\n", encoding="utf-8"
+    )
+    Path("broken.py").write_text("import no_such_package\n", encoding="utf-8")
+    assert evaluate.main(["--policy", "mine.py:dblf", "dblf", "--episodes", "20"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "dblf" in line]
+    mine, theirs = (row.split("dblf", 1)[1].split()[:3] for row in rows)
+    assert mine == theirs
+    for source, why in (
+        ("mine.py:best", "mine.py has no function best"),
+        ("mine.py:number", "mine.py has no function number"),
+        ("yours.py:dblf", "yours.py: no such file"),
+        ("broken.py:dblf", "broken.py: cannot be run: ModuleNotFoundError: No module named"),
+    ):
+        with pytest.raises(SystemExit):
+            evaluate.main(["--policy", source, "--episodes", "20"])
+        assert why in capsys.readouterr().err
+
+
+def test_boxes_without_a_bin_are_packed_into_that_of_the_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = tmp_path / "boxes.csv"
+    items.write_text("w,d,h\n4,4,1\n", encoding="utf-8")
+    assert evaluate.main(["--policy", "plain", "--items", str(items)]) == 0
+    assert "bin 10 x 10 x 10" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        evaluate.main(["--policy", "dblf", "--items", str(items)])
+    assert "boxes.csv: has no bin size of its own; give one, W D H" in capsys.readouterr().err

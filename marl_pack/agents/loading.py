@@ -31,7 +31,7 @@ from marl_pack.agents.policy import (
 )
 from marl_pack.agents.search import Planner
 from marl_pack.agents.search_settings import SearchSettings
-from marl_pack.agents.sources import path_of
+from marl_pack.agents.sources import is_own, own_policy, path_of
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import Size
 from marl_pack.items import GENERATED, Stream, independent, make_stream
@@ -65,13 +65,17 @@ class Loader:
 
         Args:
             source: one of :data:`marl_pack.agents.keys.POLICIES`, a published model's name
-                (:mod:`marl_pack.published`), or the path of a run's folder or a checkpoint.
+                (:mod:`marl_pack.published`), the path of a run's folder or a checkpoint, or
+                ``FILE.py:NAME``, a function of your own.
 
         Raises:
             ValueError, FileNotFoundError: if it is none of these.
         """
         if isinstance(source, str) and source in POLICIES:
             return make_policy(source, self.seed, self.device)
+        if isinstance(source, str) and is_own(source):
+            policy: Policy = own_policy(source)
+            return policy
         checkpoint = checkpoints.read(path_of(source, POLICIES), self.device)
         with _named(source):
             return self.policy_of(checkpoint)

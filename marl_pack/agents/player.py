@@ -12,6 +12,7 @@ from torch import Tensor
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.policy import InTurns, Placement, Policy
+from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
 from marl_pack.env_aec import AGENTS, AtOnce, raw_env
@@ -33,8 +34,8 @@ def load(
 
     Args:
         source: a heuristic (:data:`marl_pack.agents.keys.POLICIES`), a published model such
-            as ``"rs"``, or the path of a run's folder or a checkpoint: it has a folder or a suffix,
-            as ``"./NAME"`` has.
+            as ``"rs"``, the path of a run's folder or a checkpoint (it has a folder or a suffix,
+            as ``"./NAME"`` has), or ``"FILE.py:NAME"``, a function of your own.
         device: of the games; the environment plays on the CPU.
         seed: of random play and of the futures that a search imagines; None draws random play from
             torch's global generator.
@@ -50,10 +51,11 @@ def load(
     symmetric = truth_value(symmetric, "symmetric")
     if not isinstance(source, str | Path):
         raise ValueError(f"policy {shown(source)}: needs a name or a path")
-    if source in POLICIES:
+    if source in POLICIES or is_own(source):
         if symmetric or search is not None:
             raise ValueError(f"symmetric, search: need a learned policy, not {source}")
-        return Player(make_policy(str(source), seed, device))
+        own = is_own(source)
+        return Player(own_policy(str(source)) if own else make_policy(str(source), seed, device))
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
     from marl_pack.agents.loading import Loader, imagined_stream

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.checks import LARGEST_SEED, shown
 from marl_pack.config.schema import Agent, Config
 from marl_pack.options import MOST_AT_ONCE
@@ -109,7 +110,12 @@ def check_agents(config: Config) -> None:
     """Refuse impossible settings of the agents that play and learn."""
     for name, agent in (("orientation", config.orientation), ("placement", config.placement)):
         if agent.frozen and agent.policy is None:
-            refuse(f"{name}.policy", "null", "a frozen agent needs one: say who plays it")
+            heuristics = POLICIES if name == "placement" else ORIENTATION_AGENTS
+            refuse(
+                f"{name}.policy", "null",
+                f"a frozen agent needs one: {', '.join(heuristics)}, a published model, or a run's "
+                "folder or checkpoint",
+            )  # fmt: skip
         if not agent.frozen and agent.policy is not None:
             refuse(f"{name}.policy", agent.policy, f"goes with {name}.frozen: true")
         if (agent.frozen or agent.policy) and config.joint:

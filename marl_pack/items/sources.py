@@ -25,7 +25,9 @@ METHODS = tuple(name for name in MEMBERS if callable(getattr(Stream, name)))
 """Those that are methods."""
 
 
-def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
+def load(
+    path: str | Path, size: Size | None = None, otherwise: Size | None = None
+) -> tuple[Sequences, Size]:
     """Read item sequences from a file, by its ending.
 
     - ``.npz``: ``items`` [S, L, 3] or [L, 3]; if wanted, attributes by key
@@ -38,6 +40,7 @@ def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
     Args:
         path: the file.
         size: (W, D, H); by default the file's own ``bin``.
+        otherwise: the bin size if neither says one.
 
     Returns:
         The sequences and the bin size.
@@ -50,11 +53,11 @@ def load(path: str | Path, size: Size | None = None) -> tuple[Sequences, Size]:
     path = Path(path)
     if not path.is_file():
         raise no_such_file(path)
-    return _from_fields(read_fields(path), size, str(path))
+    return _from_fields(read_fields(path), size, str(path), otherwise)
 
 
 def _from_fields(
-    fields: Mapping[str, Any], size: Size | None, source: str
+    fields: Mapping[str, Any], size: Size | None, source: str, otherwise: Size | None = None
 ) -> tuple[Sequences, Size]:
     """Return the sequences that the fields of a file or a mapping give, and the bin size."""
     own = fields.get("bin")
@@ -62,9 +65,9 @@ def _from_fields(
         own = None if own is None else check_size(own)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    bin_size = own if size is None else check_size(size)
+    bin_size = own or otherwise if size is None else check_size(size)
     if bin_size is None:
-        raise ValueError(f"{source}: needs a bin size, as it has none of its own")
+        raise ValueError(f"{source}: has no bin size of its own; give one, W D H")
     if own not in (None, bin_size):
         raise ValueError(f"{source}: is for the bin {own}, not {bin_size}; give that size")
     attributes = {key: values for key, values in fields.items() if key not in ("items", "bin")}
@@ -155,16 +158,20 @@ def _generated(name: str, size: Size, sides: tuple[int, int]) -> Stream:
 
 
 def choose_stream(
-    items: str, size: Size | None = None, sides: tuple[int, int] = DEFAULT_SIDES
+    items: str,
+    size: Size | None = None,
+    sides: tuple[int, int] = DEFAULT_SIDES,
+    otherwise: Size | None = None,
 ) -> tuple[Stream, Size]:
     """Return the stream and the bin size that a command's options name.
 
     Args:
         items: a name in :data:`GENERATED` or a file.
-        size: (W, D, H); by default the file's own, else 10 × 10 × 10.
+        size: (W, D, H); by default that of the file.
         sides: shortest and longest side of generated items.
+        otherwise: the bin size if neither says one; for generated items 10 × 10 × 10.
     """
     if items in GENERATED:
-        size = (10, 10, 10) if size is None else check_size(size)
+        size = check_size(size or otherwise or (10, 10, 10))
         return make_stream(items, size, sides), size
-    return load(items, size)
+    return load(items, size, otherwise)

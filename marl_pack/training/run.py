@@ -93,6 +93,19 @@ def train(
     return runner
 
 
+def _progress(config: Config, done: int) -> str:
+    """Return where a run that is resumed goes on, for its first line.
+
+    Args:
+        config: its settings.
+        done: how many iterations it has done.
+    """
+    total = config.ppo.max_iterations
+    if done >= total:
+        return f", has done all its {total:,} iterations; --ppo.max_iterations extends it"
+    return f", goes on after iteration {done:,} of {total:,}" if done else ""
+
+
 def start(
     program: str, words: Sequence[str], config: Config | None, run: str, rest: Sequence[str]
 ) -> int:
@@ -117,8 +130,9 @@ def start(
             checkpoint = None
             if config is None:
                 config, checkpoint = resumed(run, rest)
+            done = 0 if checkpoint is None else checkpoint["iter"] + 1
             if rank() == 0:
-                console.print(f"run: {folder}", soft_wrap=True)
+                console.print(f"run: {folder}{_progress(config, done)}", soft_wrap=True)
             quiet = make_console(quiet=True)
             runner = train(config, folder, console if rank() == 0 else quiet, words, checkpoint)
     except RunInterruptedError:
