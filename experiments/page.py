@@ -1,4 +1,6 @@
-"""Make docs/results.md of the figures in results/: ``python -m experiments.page``.
+"""Make docs/results.md and the README's table of the figures in results/.
+
+``python -m experiments.page`` writes them.
 
 The page's text stands in ``experiments/results.md.jinja``, its figures in the JSON files that the
 programs of ``experiments/`` and ``benchmarks/`` write.
@@ -8,20 +10,23 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
+from docs.pages import between
+from docs.pages import table as markdown_table
 from experiments import ablations, packing, physics, planning
 from experiments.rows import main_of, mean
 from marl_pack.files import write_atomically
 from marl_pack.physics import table1
 from marl_pack.stability import RULES
 
-PAGE = ROOT / "docs" / "results.md"
+PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
 TEMPLATE = "results.md.jinja"
 RS = "rs"
 POLICIES = {
@@ -209,11 +214,32 @@ def controls_report(table: Results) -> dict[str, Any]:
     return {"number": len(outcomes), **right, "outside": -min(flips), "inside": max(0, *flips)}
 
 
+def readme(page: str, folder: Path = RESULTS) -> str:
+    """Return README.md with its table of results.
+
+    Args:
+        page: the file as it is.
+        folder: of the JSON files.
+    """
+    sets = ("RS", "CUT-1")
+    table = Results("packing", folder)
+    paper = reported()["packing"][0]
+    rows = [("", *sets), (f"{paper['who']} (reported)", *(f"{paper[name]} %" for name in sets))]
+    for policy in (RS, "max_feasible", "dblf", "random"):
+        figures = (table.row(f"--policy {policy} {packing.SETS[name]}") for name in sets)
+        rows.append((POLICIES[policy], *(f"{utilization(row)} %" for row in figures)))
+    return between(page, "results", markdown_table(*rows))
+
+
+def _write(text: str, file: BinaryIO) -> None:
+    file.write(text.encode())
+
+
 def main() -> int:
-    """Write the page; return the exit status."""
-    text = render()
-    write_atomically(PAGE, lambda file: file.write(text.encode()))
-    print(f"{PAGE}: {len(text.splitlines())} lines")
+    """Write the page and the README's table; return the exit status."""
+    for path, text in ((PAGE, render()), (README, readme(README.read_text("utf-8")))):
+        write_atomically(path, partial(_write, text))
+        print(f"{path}: {len(text.splitlines())} lines")
     return 0
 
 

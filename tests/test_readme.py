@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-DOCS = ("physics", "environment", "items", "stability")
+DOCS = ("physics", "environment", "items", "many_bins", "stability")
 PAGES = ("README.md", *(f"docs/{page}.md" for page in DOCS))
 EXAMPLES = [
     code
@@ -16,9 +16,16 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("code", EXAMPLES)
-def test_an_example_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_example_runs(
+    code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     exec(compile(code, "example", "exec"), {})
     printed = capsys.readouterr().out.strip()
     promised = re.search(r"print\(.*\)  # ([^:\n]*)", code)
     assert printed == promised[1] if promised else printed
-    assert len(EXAMPLES) == 9
+
+
+def test_every_page_with_examples_has_them_read() -> None:
+    pages = {page for page in PAGES if "```python" in (ROOT / page).read_text("utf-8")}
+    assert pages == set(PAGES)
