@@ -25,7 +25,7 @@ MODELS = ROOT / "models"
 OTHERS = ("cut_1_first", "cut_1_second", "cut_1_third", "cut_1_fourth", "cut_1", "cut_2_first",
           "cut_2_second", "cut_2", "types125")  # fmt: skip
 
-CPUS = {"types125": "AMD EPYC"}
+CPUS = {"types125": "AMD EPYC", "plain": "AMD EPYC"}
 """Where runs were trained that were not trained on the usual machine."""
 CPU = "Intel Xeon with AVX-512"
 
@@ -110,12 +110,13 @@ def main() -> int:
             print(run, figures(run, {}))
         return 0
     others = levels()
-    draw([MODELS / "rs.csv"], ROOT / "docs" / "learning_curve.png", others)
+    on_rs = [MODELS / "rs.csv", MODELS / "plain.csv"]
+    draw(on_rs, ROOT / "docs" / "learning_curve.png", others)
     rest = [MODELS / f"{name}.csv" for name in OTHERS]
     draw(rest, ROOT / "docs" / "learning_curve_others.png", {})
     results = Results("learning_curve")
-    for run in (MODELS / "rs.csv", *rest):
-        own = figures(run, others if run.stem == "rs" else {})
+    for run in (*on_rs, *rest):
+        own = figures(run, others if run in on_rs else {})
         made = record("python -m experiments.learning_curve", cpu=CPUS.get(run.stem, CPU))
         results.put(run.stem, own, made)
     return 0

@@ -36,9 +36,9 @@ SETS = {
     "125 types": "--items rs --sides 1 5 --episodes 2100 --seed 0",
 }
 MODELS = {
-    "RS": ("rs", "rs --symmetric"),
-    "CUT-1": ("rs", "cut_1"),
-    "CUT-2": ("rs", "cut_2"),
+    "RS": ("rs", "rs --symmetric", "plain"),
+    "CUT-1": ("rs", "cut_1", "plain"),
+    "CUT-2": ("rs", "cut_2", "plain"),
     "125 types": ("rs", "types125"),
 }
 HEURISTICS = ("max_feasible", "dblf", "height_min", "best_fit", "random")

@@ -34,6 +34,7 @@ POLICIES = {
     "cut_1": "`cut_1`, trained on CUT-1",
     "cut_2": "`cut_2`, trained on CUT-2",
     "types125": "`types125`, trained on 125 types",
+    "plain": "`plain`, trained on RS, without the planes `feasible_*` and `afterstate_value`",
     **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
 }
 """What the rows of the first table are called."""
@@ -79,7 +80,7 @@ def render(folder: Path = RESULTS) -> str:
         plans=[(plan, tables["planning"].row(f"{RS}, {plan}"))
                for plan in (planning.NONE, *planning.PLANS)],
         curves=tables["learning_curve"].rows(),
-        order=("rs", "cut_1", "cut_2", "types125"),
+        order=("rs", "plain", "cut_1", "cut_2", "types125"),
         spreads=tables["volume_spread"].rows(),
         greedy=tables["afterstates"].rows(),
         ablations_table=ablations_table(tables["ablations"]),
