@@ -83,7 +83,8 @@ def test_the_environment_is_checked_too() -> None:
 @pytest.mark.usefixtures("checked")
 def test_the_games_that_a_search_imagines_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    network, lookahead = {"channels": 8, "layers": 2}, Lookahead()
+    planes, lookahead = ["mask", "resting_height", "waste"], Lookahead()
+    network = {"channels": 8, "layers": 2, "planes": planes}
     agents = (
         LearnedAgent(kind, make_actor(kind, network, "cpu").eval(), lookahead)
         for kind in ("orientation", "placement")

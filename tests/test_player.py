@@ -18,7 +18,8 @@ OTHER = {"pad_actions": True, "mask_in": "info", "margin": 0.2, "orientations": 
 
 def joint() -> Player:
     torch.manual_seed(1)
-    actor = make_actor("joint", {"channels": 4, "layers": 1}, "cpu").eval()
+    network = {"channels": 4, "layers": 1, "planes": ["mask", "resting_height", "waste"]}
+    actor = make_actor("joint", network, "cpu").eval()
     for weight in actor.mlp.parameters():
         weight.data.mul_(30)  # else a fresh network is almost uniform
     return Player(JointPolicy(LearnedAgent("joint", actor, Lookahead())))

@@ -24,7 +24,10 @@ from marl_pack.game.packing import Packing
 from marl_pack.items import Uniform, make_stream
 
 SIZE = (6, 6, 6)
-NETWORK = {"channels": 8, "layers": 2}
+NETWORK = {
+    "channels": 8, "layers": 2, "shortcut": False, "context": False,
+    "planes": ["mask", "resting_height", "waste"],
+}  # fmt: skip
 FUTURES = make_stream("rs", SIZE, (1, 3))
 Agents = tuple[LearnedAgent, LearnedAgent]
 
