@@ -89,7 +89,7 @@ def test_evaluate_takes_runs_and_mixtures(runs: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(("options", "message"), [
     (["--orientation", "first"], "go together"),
     (["--policy", "nobody"], "'nobody': needs one of dblf"),
-    (["--orientation", "nobody", "--placement", "dblf"], "first, cut_1, cut_2, rs"),
+    (["--orientation", "nobody", "--placement", "dblf"], "first, cut_1, cut_2, "),
     (["--policy", "most_room"], "policy 'most_room' is now called 'max_feasible'"),
     (["--orientation", "first", "--placement", "most_room"], "'most_room' is now called"),
 ])  # fmt: skip

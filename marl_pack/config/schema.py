@@ -44,7 +44,7 @@ class Agent:
     Args:
         frozen: whether it plays without learning.
         policy: who plays a frozen agent: {policies}, for the orientation agent also first (as the
-            item comes), or a run's folder or checkpoint.
+            item comes), a published model such as rs, or a run's folder or checkpoint.
         network: shape of its network.
         teacher: the agent whose choices it clones at first, as for policy; null for none.
         teacher_iterations: for how many iterations it clones the teacher.
@@ -161,8 +161,8 @@ class Config:
         threads: threads on the CPU.
         joint: one agent that chooses the pair (orientation, cell) in place of the two; its network
             is placement.network.
-        init: a run's folder or checkpoint whose weights the learning agents begin with; null for
-            fresh ones.
+        init: a published model such as rs, or a run's folder or checkpoint, whose weights the
+            learning agents begin with; null for fresh ones.
         game: the game.
         orientation: the agent that chooses the orientation.
         placement: the agent that places the item.
