@@ -195,6 +195,16 @@ class Plan:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __str__(self) -> str:
+        boxes = f"{len(self)} box" + "es" * (len(self) != 1)
+        unit = "cells" if self.unit_mm is None else f"units of {self.unit_mm:g} mm"
+        if len(self.bin_sizes) == 1:
+            sides = " × ".join(f"{side:g}" for side in self.bin_sizes[0].tolist())
+            bins = f"a bin of {sides} {unit}"
+        else:
+            bins = f"{len(self.bin_sizes)} bins, in {unit}"
+        return f"{boxes} in {bins}, {self.utilization:.1%} filled"
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
             return NotImplemented

@@ -298,3 +298,10 @@ def test_labels_of_a_state_become_ids_and_orientations() -> None:
     assert plan.ids == ("second", "")
     assert plan.orientations.tolist() == [3, -1]
     assert Plan.from_bins(Labelled(), 0).ids == ("1", "")  # type: ignore[arg-type]  # the same
+
+
+def test_a_plan_prints_as_one_line() -> None:
+    boxes = [(0, 0, 0, 400, 300, 200), (0, 0, 200, 400, 300, 300)]
+    plan = Plan.of_boxes((800, 300, 1000), boxes, unit_mm=1)
+    assert str(plan) == "2 boxes in a bin of 800 × 300 × 1000 units of 1 mm, 25.0% filled"
+    assert str(plan.first(1)).startswith("1 box in a bin of ")
