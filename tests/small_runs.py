@@ -15,6 +15,12 @@ from marl_pack.config import Config, parse
 PLAIN = f"--config={Path(__file__).parent.parent / 'configs' / 'plain.yaml'}"
 """Settings whose agents see no afterstates, which take most of a small run's time."""
 
+PLAIN_NETWORK = {
+    "channels": 8, "layers": 2, "shortcut": False, "context": False,
+    "planes": ["mask", "resting_height", "waste"],
+}  # fmt: skip
+"""The shape of a small network of such agents."""
+
 TINY = (
     PLAIN,
     "--game.bin=[4,4,4]", "--game.sides=[1,3]", "--ppo.num_envs=16", "--ppo.num_steps_per_env=4",

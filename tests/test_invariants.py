@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import in_play
+from small_runs import PLAIN_NETWORK
 
 from marl_pack import bins as bin_state
 from marl_pack import env_aec
@@ -83,10 +84,9 @@ def test_the_environment_is_checked_too() -> None:
 @pytest.mark.usefixtures("checked")
 def test_the_games_that_a_search_imagines_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    planes, lookahead = ["mask", "resting_height", "waste"], Lookahead()
-    network = {"channels": 8, "layers": 2, "planes": planes}
+    lookahead = Lookahead()
     agents = (
-        LearnedAgent(kind, make_actor(kind, network, "cpu").eval(), lookahead)
+        LearnedAgent(kind, make_actor(kind, PLAIN_NETWORK, "cpu").eval(), lookahead)
         for kind in ("orientation", "placement")
     )
     futures = make_stream("rs", (4, 4, 5), (1, 3))

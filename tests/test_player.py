@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from pettingzoo import AECEnv
+from small_runs import PLAIN_NETWORK
 
 from marl_pack import Packing, Player, SearchSettings, env, load, parallel_env
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -18,8 +19,7 @@ OTHER = {"pad_actions": True, "mask_in": "info", "margin": 0.2, "orientations": 
 
 def joint() -> Player:
     torch.manual_seed(1)
-    network = {"channels": 4, "layers": 1, "planes": ["mask", "resting_height", "waste"]}
-    actor = make_actor("joint", network, "cpu").eval()
+    actor = make_actor("joint", PLAIN_NETWORK | {"channels": 4, "layers": 1}, "cpu").eval()
     for weight in actor.mlp.parameters():
         weight.data.mul_(30)  # else a fresh network is almost uniform
     return Player(JointPolicy(LearnedAgent("joint", actor, Lookahead())))

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_runs import PLAIN_NETWORK
 from torch import Tensor
 
 from marl_pack.agents import search
@@ -24,10 +25,6 @@ from marl_pack.game.packing import Packing
 from marl_pack.items import Uniform, make_stream
 
 SIZE = (6, 6, 6)
-NETWORK = {
-    "channels": 8, "layers": 2, "shortcut": False, "context": False,
-    "planes": ["mask", "resting_height", "waste"],
-}  # fmt: skip
 FUTURES = make_stream("rs", SIZE, (1, 3))
 Agents = tuple[LearnedAgent, LearnedAgent]
 
@@ -42,7 +39,7 @@ def agents() -> Agents:
     torch.manual_seed(0)
     lookahead = Lookahead()
     first, second = (
-        LearnedAgent(kind, make_actor(kind, NETWORK, "cpu").eval(), lookahead)
+        LearnedAgent(kind, make_actor(kind, PLAIN_NETWORK, "cpu").eval(), lookahead)
         for kind in ("orientation", "placement")
     )
     return first, second
@@ -287,7 +284,7 @@ def test_the_work_may_be_split_into_parts(agents: Agents, monkeypatch: pytest.Mo
 def test_a_depth_needs_a_critic(agents: Agents) -> None:
     with pytest.raises(ValueError, match="critic"):
         Planner(*agents, None, SearchSettings(depth=2), FUTURES)
-    critic = make_critic("orientation", NETWORK, "cpu", agents[0].actor)
+    critic = make_critic("orientation", PLAIN_NETWORK, "cpu", agents[0].actor)
     Planner(*agents, critic, SearchSettings(depth=2), FUTURES)
 
 
