@@ -40,12 +40,13 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     options = parser(program)
     chosen = options.parse_args(arguments)
     console = make_console()
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
         resolve(chosen.checkpoint)
         with make_status(console, "loading the agents"):
             from marl_pack.export.writers import run  # slow to import
 
+        # Importing torch sets the levels of its loggers.
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         run(chosen.checkpoint, chosen.folder, chosen.format, console)
     except KeyboardInterrupt:
         options.exit(130, f"{options.prog}: interrupted")
