@@ -1,7 +1,7 @@
-"""The choice between two implementations with equal results: compiled loops, and tensor code.
+"""Choose between two implementations with equal results: compiled loops and tensor code.
 
-A backend is chosen once, where bins are made (:func:`marl_pack.bins.empty`), from their device.
-Every operation on these bins asks it which of two functions to call.
+A backend is chosen once, from the device, when bins are made (:func:`marl_pack.bins.empty`). Every
+operation on these bins calls :meth:`Backend.pick` to select one of two functions.
 """
 
 from __future__ import annotations

@@ -34,9 +34,10 @@ ROW_PER_BOX = {"row_per_box": True}
 class Bins:
     """The state of N bins of one size.
 
-    The table of boxes (``boxes``, ``loads``, ``labels`` and ``count``) is the truth; ``heightmap``,
-    ``empty_map`` and ``filled`` are derived from it and stored beside it for speed. The tensors are
-    written in place by :func:`place` and :func:`clear`. Rows of the table past ``count`` are void.
+    The table of boxes (``boxes``, ``loads``, ``labels`` and ``count``) defines the state.
+    ``heightmap``, ``empty_map`` and ``filled`` are computed from it and stored for speed.
+    :func:`place` and :func:`clear` change the tensors in place. Rows of the table from ``count`` on
+    have no meaning.
     """
 
     heightmap: Tensor  # int16 [N, W, D]   top of each column, in cells
@@ -70,7 +71,7 @@ class Bins:
         return self.map(lambda tensor: tensor[index])
 
     def to(self, device: torch.device | str) -> Bins:
-        """Return the bins on ``device``, with its default backend unless they are there."""
+        """Return the bins on ``device``; another device brings its default backend."""
         moved = self.map(lambda tensor: tensor.to(device))
         if moved.device == self.device:
             return moved
@@ -81,7 +82,7 @@ class Bins:
         return self.map(Tensor.clone)
 
     def for_boxes(self, most: int) -> Bins:
-        """Return bins that can hold at least ``most`` boxes; everything else is shared."""
+        """Return bins that can hold at least ``most`` boxes; the other tensors are shared."""
         more = most - self.boxes.shape[1]
         if more <= 0:
             return self
@@ -90,7 +91,7 @@ class Bins:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Bins:
         """Return the bins with ``change`` applied to every tensor."""
-        # By position: dataclasses.replace takes as long as the changes themselves.
+        # Arguments by position: dataclasses.replace would take as long as the changes.
         values: list[Any] = [*map(change, self.tensors()), self.height, self.backend]
         return Bins(*values)
 
@@ -119,8 +120,8 @@ def empty(
         n: number of bins.
         size: (W, D, H) in cells.
         max_boxes: M, the most boxes a bin may ever hold; the bin's volume in cells by default.
-        device: where the tensors live.
-        backend: computes what depends on the bins; the device's default if None.
+        device: the device of the tensors.
+        backend: the implementation to use for these bins; by default the faster one on the device.
 
     Raises:
         ValueError: if the size is impossible.
@@ -164,7 +165,7 @@ def check_device(device: torch.device | str) -> torch.device:
     """
     try:
         checked = torch.device(device)
-    except (RuntimeError, TypeError):  # its text lists two dozen kinds of devices
+    except (RuntimeError, TypeError):  # PyTorch's message lists two dozen kinds of devices
         checked = torch.device("meta")
     try:
         if checked.type not in ("cpu", "cuda"):
@@ -185,36 +186,36 @@ def place(
     labels: tuple[Tensor, Tensor] | None = None,
     unit: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Place one box in each bin from above, in place (Algorithm 2 for the empty map).
+    """Place one box in each bin from above and update the bins (Algorithm 2 for the empty map).
 
     The box comes to rest on the highest column of its footprint. No stability rule is applied: the
-    caller chooses among the cells a mask allows. A box with a zero side leaves its bin as it is.
+    caller must choose a cell that a mask allows. A box with a zero side does not change its bin.
 
     Args:
-        bins: written in place.
+        bins: the N bins; updated.
         sides: int [N, 3], the boxes' sides along x, y, z.
-        corners: int64 [N, 2], the low corners (x, y).
-        weights: float [N]; the boxes' volumes by default.
-        com: float [N, 2], centre of mass from the low corner in units; the footprint's centre by
-            default.
+        corners: int64 [N, 2], the boxes' low corners (x, y).
+        weights: float [N], the boxes' weights; by default their volumes.
+        com: float [N, 2], each centre of mass, measured from the low corner in units of
+            1 / ``unit`` cells; by default the footprint's centre.
         labels: ids and orientations of the boxes' items, int64 [N] each; unknown (-1) by default.
-        unit: units of ``com`` in a cell. With whole numbers in ``com`` the stored centres are those
-            numbers rounded once, so that they are the nearest to the exact ones.
+        unit: number of units in a cell. If ``com`` contains whole numbers, each stored centre is
+            rounded only once, so it is the float64 that is nearest to the exact centre.
 
     Returns:
         Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
         volumes int64 [N]; 0 where nothing was placed.
 
     Raises:
-        ValueError: if a bin holds as many boxes as it may, or a box reaches out of the map; nothing
-            has changed then.
+        ValueError: if a bin is full, or a box reaches out of the map. The bins have not changed
+            then.
     """
     code = bins.backend.pick(compiled=_place_compiled, tensor=_place_tensor)
     return code(bins, sides, corners, weights, com, labels, unit)
 
 
 def _refuse(bins: Bins, full: bool) -> None:
-    """Raise the error of an impossible placement."""
+    """Raise ValueError for an impossible placement: a bin is full, or a box is outside the map."""
     if full:
         most = bins.boxes.shape[1]
         raise ValueError(f"a bin that can hold {most} boxes is full: see max_boxes")
@@ -279,7 +280,7 @@ def _place_compiled(
     labels: tuple[Tensor, Tensor] | None,
     unit: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Place one box in each bin in compiled loops; arguments as :func:`place`."""
+    """Place one box in each bin in compiled loops; the arguments are those of :func:`place`."""
     state = [tensor.numpy() for tensor in bins.tensors()]
     box = sides.numpy(), corners.numpy()
     obstacle = _obstacle(bins.boxes.shape[1], bins.size[:2], state[TENSORS.index("count")], *box)
@@ -313,7 +314,7 @@ def _place_tensor(
     labels: tuple[Tensor, Tensor] | None,
     unit: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Place one box in each bin in tensor code; arguments as :func:`place`."""
+    """Place one box in each bin in tensor code; the arguments are those of :func:`place`."""
     volume = sides.long().prod(1)
     real = volume > 0
     far = corners + sides[:, :2]

@@ -1,4 +1,4 @@
-"""Check single values and describe them in messages: each is what it says, and nothing else."""
+"""Check single values, and describe values in messages."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ TYPE_NAMES = {
     bool: "true or false", int: "a whole number", float: "a number", str: "a text",
     type(None): "null",
 }  # fmt: skip
-"""What a value of a type is called in messages."""
+"""The names of types in messages."""
 
 
 def truth_value(value: Any, what: str) -> bool:
-    """Return a truth value as a bool: a bool or a NumPy bool, no number or text.
+    """Return a truth value as a bool; accept a bool or a NumPy bool, but no number or text.
 
     Args:
-        value: to check.
-        what: names the value, for the message.
+        value: the value to check.
+        what: the name of the value, for the message.
 
     Raises:
         ValueError: naming the value and what it needs to be.
@@ -45,11 +45,11 @@ def truth_value(value: Any, what: str) -> bool:
 
 
 def whole_number(value: Any, what: str, low: int, high: int | None = None) -> int:
-    """Return a whole number as an int: an int or a NumPy integer, no bool, float or text.
+    """Return a whole number as an int; accept an int or a NumPy integer, no bool, float or text.
 
     Args:
-        value: to check.
-        what: names the value, for the message.
+        value: the value to check.
+        what: the name of the value, for the message.
         low: the smallest number allowed.
         high: the largest number allowed; None if there is none.
 
@@ -64,13 +64,13 @@ def whole_number(value: Any, what: str, low: int, high: int | None = None) -> in
 
 
 def real_number(value: Any, what: str) -> float:
-    """Return a finite number as a float: a Python or NumPy number, no bool or text.
+    """Return a finite number as a float; accept a Python or NumPy number, but no bool or text.
 
-    A NumPy number of any width means the decimal that it shows as, as a float does.
+    A NumPy number of any width stands for the decimal number that it is printed as, like a float.
 
     Args:
-        value: to check.
-        what: names the value, for the message.
+        value: the value to check.
+        what: the name of the value, for the message.
 
     Raises:
         ValueError: naming the value and what it needs to be.
@@ -89,7 +89,7 @@ def real_number(value: Any, what: str) -> float:
 
 
 def decimals(numbers: NDArray[Any]) -> NDArray[np.float64]:
-    """Return numbers of any width as float64; each means the decimal that it shows as."""
+    """Return numbers of any width as float64; each stands for the decimal it is printed as."""
     if numbers.dtype.kind == "f" and numbers.dtype != np.float64:
         numbers = numbers.astype(str)
     return numbers.astype(np.float64)
@@ -97,13 +97,13 @@ def decimals(numbers: NDArray[Any]) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1 << 14)  # the cells of a table repeat
 def number_in(text: str) -> float:
-    """Return the number that a text is in decimal notation, an int if it has only digits.
+    """Return the number that a text contains in decimal notation; an int if it has only digits.
 
     Raises:
         ValueError: for other text, such as ``1_0``, digits of other scripts, ``nan`` or spaces.
     """
     try:
-        if DECIMAL.issuperset(text):  # so float() reads plain decimals alone
+        if DECIMAL.issuperset(text):  # so float() reads only plain decimals
             return int(text) if text.lstrip("+-").isdigit() and len(text) < 20 else float(text)
     except ValueError:
         pass
@@ -120,7 +120,7 @@ def shown(value: Any) -> str:
 
 
 def described(value: Any) -> str:
-    """Return a few words for a value: an array or a tensor by its type and shape."""
+    """Describe a value in a few words: an array or a tensor by its type and shape."""
     if isinstance(value, np.generic) or not hasattr(value, "dtype"):
         return shown(value)
     kind = "a NumPy array of " if isinstance(value, np.ndarray) else ""
@@ -128,11 +128,11 @@ def described(value: Any) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text whose characters can all be printed, the others as escapes."""
+    """Return a text in which characters that cannot be printed are replaced by escapes."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def one_line(text: str, longest: int = LONGEST_LINE) -> str:
-    """Return a text as one line of printable characters, cut off after ``longest``."""
+    """Return a text as one line of at most ``longest`` printable characters."""
     line = printable(" ".join(text.split()))
     return line if len(line) <= longest else f"{line[: longest - 3]}..."

@@ -1,4 +1,4 @@
-"""Say how a package that only some commands need is installed."""
+"""Tell users how to install a package that only some commands need."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ def missing(error: ModuleNotFoundError, what: str, extra: str) -> ModuleNotFound
     """Return the error that an optional package is missing, with the command that installs it.
 
     Args:
-        error: of the import.
-        what: names what needs the package, and the package.
-        extra: of ``pyproject.toml`` that has it.
+        error: the error that the import raised.
+        what: says which feature needs which package, for the message.
+        extra: the extra in ``pyproject.toml`` that contains the package.
     """
     return ModuleNotFoundError(
         f'{error}: {what}; run pip install -e ".[{extra}]" in marl_pack\'s source'

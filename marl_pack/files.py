@@ -1,7 +1,7 @@
 """Write files so that they are complete or do not exist.
 
-A file is written beside its place under a name that nobody else has, and moved into place once it
-is whole. Links are followed. A device, a pipe or the program's own output is written through.
+A file is first written in the same folder under a unique temporary name, and is renamed when it is
+complete. Links are followed. A device, a pipe or the program's own output is written directly.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from typing import Any, Generic, Self, TypeVar
 T = TypeVar("T")
 
 DESCRIPTORS = "/dev/fd", "/proc/self/fd"  # folders of the files that a program has open
-PART = ".part-"  # what the names of unfinished files begin with
-WRITING = 0.05  # share of the time in which a growing file is written, at most
+PART = ".part-"  # the names of unfinished files begin with this
+WRITING = 0.05  # largest share of the time that is spent on writing a growing file
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """Return the status of the file that a path leads to; None if there is none yet."""
+    """Return the status of the file that a path leads to; None if it does not exist."""
     try:
         return path.stat()
     except FileNotFoundError:
@@ -37,7 +37,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 
 def _stream(path: Path, status: os.stat_result) -> int | None:
-    """Return the descriptor of the program's own output that a file is, if it is one."""
+    """Return the descriptor of the program's own output if the file is this output, or None."""
     named = [int(path.name)] if str(path.parent) in DESCRIPTORS and path.name.isdecimal() else []
     for descriptor in (1, 2, *named):
         with suppress(OSError):  # it may be closed
@@ -47,7 +47,7 @@ def _stream(path: Path, status: os.stat_result) -> int | None:
 
 
 def _written_through(path: Path, status: os.stat_result | None) -> bool:
-    """Return whether a file is no plain file that could be replaced."""
+    """Return whether a file exists but is not a plain file, so that it cannot be replaced."""
     return status is not None and not (
         stat.S_ISREG(status.st_mode) and _stream(path, status) is None
     )
@@ -82,10 +82,12 @@ def same_plain_file(a: Path, b: Path) -> bool:
 def moved_into_place(path: Path) -> Iterator[Path]:
     """Yield an empty temporary file with the same ending; move it into place at the end.
 
-    An existing file keeps its mode and owner. What is no plain file receives the content instead.
+    An existing file keeps its mode and owner. If ``path`` is not a plain file, the content is
+    copied into it instead.
 
     Raises:
-        OSError: naming ``path``, if it cannot be written; a file that was there stays.
+        OSError: if the file cannot be written; the message names ``path``. An existing file does
+            not change then.
     """
     try:
         status = _status(path)
@@ -98,23 +100,23 @@ def moved_into_place(path: Path) -> Iterator[Path]:
             with _replacing(Path(os.path.realpath(path)), status) as part:
                 yield part
     except OSError as error:
-        if error.errno is None:  # a library's own, which may show a whole log
+        if error.errno is None:  # the error of a library, whose message may be a whole log
             raise OSError(f"{path}: {str(error).splitlines()[0]}") from None
         raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 @contextmanager
 def _replacing(target: Path, status: os.stat_result | None) -> Iterator[Path]:
-    """Yield a temporary file in the folder of a plain file, and replace that at the end."""
+    """Yield a temporary file in the folder of ``target``, and replace ``target`` at the end."""
     part = target.with_name(f"{PART}{secrets.token_hex(8)}{target.suffix}")
-    mode = 0o666 if status is None else 0o600  # less what the umask takes away
+    mode = 0o666 if status is None else 0o600  # minus the bits that the umask clears
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
     try:
         yield part
         with part.open("r+b") as file:
             os.fsync(file.fileno())
         if status is not None:
-            with suppress(PermissionError):  # another's file in a shared folder
+            with suppress(PermissionError):  # the file of another user
                 shutil.chown(part, status.st_uid, status.st_gid)
             part.chmod(stat.S_IMODE(status.st_mode))
         part.replace(target)
@@ -134,7 +136,7 @@ def _write_through(path: Path, part: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed programs have left unfinished; the caller knows that none writes there."""
+    """Remove unfinished files of killed programs; no other program may be writing there."""
     for part in folder.glob(f"{PART}*"):
         part.unlink(missing_ok=True)
 
@@ -143,8 +145,9 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
     """Write a file under another name and move it into place once it is complete.
 
     Args:
-        path: of the file.
-        write: is called with a binary file in memory, so that its errors are not the disk's.
+        path: the file to write.
+        write: a function that writes the content to a binary file in memory, so that its errors
+            are not errors of the disk.
     """
     content = io.BytesIO()
     write(content)
@@ -153,7 +156,7 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
 
 
 def write_json(path: Path, report: Any) -> None:
-    """Write figures as JSON: unknown types as text, NaN refused with ValueError."""
+    """Write a report as JSON: values of unknown types become texts, NaN raises ValueError."""
     text = json.dumps(report, indent=2, default=str, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
 
@@ -166,18 +169,19 @@ def write_csv(path: Path, lines: Iterable[Sequence[Any]]) -> None:
 
 
 class Growing(Generic[T]):
-    """A file that is written again as its content grows, so that a stopped program leaves it.
+    """A file that is rewritten while its content grows, so that a stopped program leaves a file.
 
     Args:
-        path: of the file; None writes nothing. What is no plain file is written once, at the end.
-        write: a function (path, content) that writes it.
+        path: the file to write; None writes nothing. If it is not a plain file, it is written only
+            once, at the end.
+        write: a function (path, content) that writes the file.
     """
 
     def __init__(self, path: Path | None, write: Callable[[Path, T], None]) -> None:
         self.path, self.write = path, write
         self.at_end = path is not None and _written_through(path, _status(path))
-        self.content: T | None = None  # that is not yet written
-        self.next = 0.0  # when it may be written again
+        self.content: T | None = None  # content that is not yet written
+        self.next = 0.0  # earliest time at which the file is written again
 
     def __enter__(self) -> Self:
         return self

@@ -1,6 +1,6 @@
-"""Read files that others wrote: JSON, CSV tables and npz archives, within limits of size.
+"""Read JSON, CSV and npz files from users, up to a limit on the size.
 
-Every fault is a ValueError of one line that begins with the file's name.
+Every error is a ValueError with a one-line message that begins with the file's name.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file; a key that an object has twice is refused."""
+    """Return the content of a JSON file; refuse an object that has a key twice."""
     text = read_text(path)
     try:
         return json.loads(text, object_pairs_hook=_object)
@@ -67,11 +67,11 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_lines(path: Path, *, trim: bool = False) -> Iterator[tuple[int, list[str]]]:
-    """Yield the values of each line of a CSV file that is not empty, after the line's number.
+    """Yield the number and the values of each line of a CSV file that is not empty.
 
     Args:
-        path: of the file.
-        trim: whether spaces after commas are no part of a value.
+        path: the file to read.
+        trim: whether to remove spaces after commas.
     """
     text = io.StringIO(read_text(path), newline="")
     reader = csv.reader(text, skipinitialspace=trim, strict=True)
@@ -97,7 +97,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                     raise ValueError(f"it needs to unpack to at most {MAX_ARRAYS >> 20} MiB")
                 arrays = {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
                 if len(arrays) < len(members):
-                    raise ValueError("it has two arrays of one name")
+                    raise ValueError("it has two arrays of the same name")
                 return arrays
         except Exception as error:  # a broken archive raises errors of a dozen types
             reason = one_line(str(error), 200) or type(error).__name__

@@ -1,4 +1,4 @@
-"""Compile functions by Numba, with a cache on disk where the installation allows it."""
+"""Compile functions with Numba, and cache the compiled code on disk where possible."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class _Cache(FunctionCache):
     """Numba's cache of one function; a full disk or a damaged file does not stop the program."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled function; None if it is not there or cannot be read."""
+        """Return the compiled function; None if it is not in the cache or cannot be read."""
         try:
             compiled = super().load_overload(sig, target_context)
         except (OSError, EOFError, UnpicklingError) as error:
@@ -34,31 +34,31 @@ class _Cache(FunctionCache):
 
 
 class _Compiling:
-    """The message that code is compiled because the cache does not have it, once a process."""
+    """The message, shown once a process, that code is compiled because it is not in the cache."""
 
     say: Callable[[str], object] | None = None
 
     @classmethod
     def announce(cls) -> None:
-        """Say so unless that was done before."""
+        """Show the message unless it was shown before."""
         if cls.say is not None:
-            cls.say("compiling code that is new here: about 20 seconds, at the first start alone")
+            cls.say("compiling code: this takes about 20 seconds, at the first start only")
             cls.say = None
 
 
 def announce_compiling(say: Callable[[str], object]) -> None:
-    """Have ``say`` called with a sentence before code is compiled for the first time."""
+    """Set the function that shows a message before code is compiled for the first time."""
     _Compiling.say = say
 
 
 class _Uncached:
-    """The warning that compiled code is not cached, once a process."""
+    """The warning, shown once a process, that compiled code is not cached."""
 
     warned = False
 
     @classmethod
     def warn(cls, reason: Exception) -> None:
-        """Warn unless that was done before."""
+        """Show the warning unless it was shown before."""
         if not cls.warned:
             cls.warned = True
             warnings.warn(
@@ -72,8 +72,8 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return numba.njit's decorator, which compiles in memory where no cache can be written.
 
     Args:
-        cache: whether the compiled code is cached on disk if that is possible.
-        **options: of ``numba.njit``.
+        cache: whether to cache the compiled code on disk if that is possible.
+        **options: other options of ``numba.njit``.
     """
 
     def decorate(function: Any) -> Any:

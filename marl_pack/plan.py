@@ -1,8 +1,8 @@
 """Plans: boxes as they were placed, in order, in one bin or several.
 
-A plan is the result of a game, or of any other program that places boxes. It is immutable. It reads
-and writes JSON and CSV, which are meant for other programs; archives of many plans are in
-:mod:`marl_pack.plan_archive`. Shapes use the letters B (bins) and n (boxes).
+A plan is the result of a game, or of any other program that places boxes. It is immutable. It can
+be written to JSON and CSV files, which other programs can read, and be read from them. Archives of
+many plans are in :mod:`marl_pack.plan_archive`. Shapes use the letters B (bins) and n (boxes).
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Plan:
         self._refuse(off.any(1), "needs a centre of mass inside the box")
 
     def _refuse(self, wrong: Any, why: str) -> None:
-        """Raise ValueError with the first box for which ``wrong`` [n] is true."""
+        """Raise ValueError about the first box for which ``wrong`` [n] is true, if there is one."""
         if wrong.any():
             i = int(wrong.argmax())
             row = ", ".join(f"{value:g}" for value in self.boxes[i])
@@ -141,7 +141,7 @@ class Plan:
             unit_mm: millimetres of one unit of length; None for abstract cells.
 
         Raises:
-            ValueError: as the constructor.
+            ValueError: in the same cases as the constructor.
         """
         boxes = np.asarray(boxes)
         boxes = boxes if boxes.size else boxes.reshape(0, 6)
@@ -173,13 +173,13 @@ class Plan:
         id_names: Sequence[str] | None = None,
         unit_mm: float | None = None,
     ) -> Plan:
-        """Return the plan of one bin of a game's state.
+        """Return the plan of one bin.
 
         Args:
-            bins: the state, on the CPU.
+            bins: the state of the bins, on the CPU.
             game: index of the bin.
-            id_names: text of each number that the state stores as an item's id; by default the
-                number itself.
+            id_names: ``id_names[i]`` is the text of the id that the state stores as the number i;
+                by default the text is the number itself.
             unit_mm: millimetres of a cell, if known.
         """
         n = int(bins.count[game])
@@ -211,7 +211,7 @@ class Plan:
         mine, theirs = ([getattr(plan, f.name) for f in fields(Plan)] for plan in (self, other))
         return all(map(np.array_equal, mine[:-2], theirs[:-2])) and mine[-2:] == theirs[-2:]
 
-    __hash__ = None  # type: ignore[assignment]  # arrays have none
+    __hash__ = None  # type: ignore[assignment]  # arrays have no hash
 
     @property
     def boxes(self) -> Array:
@@ -229,7 +229,7 @@ class Plan:
         return float(_volume(self.sides) / _volume(self.bin_sizes))
 
     def first(self, count: int) -> Plan:
-        """Return the plan as it was when ``count`` boxes had been placed."""
+        """Return the plan of the first ``count`` boxes, in the same bins."""
         return self._select(np.arange(len(self)) < count, self.bins, self.bin_sizes)
 
     def in_bin(self, index: int) -> Plan:
@@ -238,7 +238,7 @@ class Plan:
         return self._select(self.bins == index, np.zeros_like(self.bins), sizes)
 
     def _select(self, which: NDArray[np.bool_], bins: Array, bin_sizes: Array) -> Plan:
-        """Return the plan of the boxes ``which``, in other bins."""
+        """Return the plan of the boxes ``which`` [n]; ``bins`` [n] replaces the bin of each box."""
         return Plan(
             bin_sizes, bins[which], self.positions[which], self.sides[which],
             self.orientations[which], self.weights[which], self.centres[which],
@@ -249,7 +249,7 @@ class Plan:
     # --- files of one plan ------------------------------------------------------------------------
 
     def _rows(self) -> list[list[Any]]:
-        """Return the values of :data:`BOX` for each box, as Python's own types."""
+        """Return the values of :data:`BOX` for each box, as Python numbers and texts."""
         columns = (self.bins, self.positions, self.sides, self.orientations, self.weights,
                    self.centres)  # fmt: skip
         parts = [np.atleast_2d(array.T).T.tolist() for array in columns]
@@ -257,7 +257,7 @@ class Plan:
 
     @classmethod
     def _of_rows(cls, bin_sizes: Any, rows: Sequence[Sequence[Any]], unit_mm: Any) -> Plan:
-        """Return the plan of rows as :meth:`_rows` returns them."""
+        """Return the plan that has these rows (see :meth:`_rows`)."""
         table = dict(zip(BOX, zip(*rows, strict=True), strict=True)) if rows else {}
 
         def columns(*names: str) -> Array:
@@ -270,23 +270,23 @@ class Plan:
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan as JSON has it: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
+        """Return the plan as a dict for JSON: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
 
-        Each box is an object with the keys :data:`BOX`.
+        Each box is a dict with the keys :data:`BOX`.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
         return {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes}
 
     @classmethod
     def of_dict(cls, content: Any, source: str) -> Plan:
-        """Return the plan of an object as :meth:`to_dict` returns it.
+        """Return the plan that a dict describes; :meth:`to_dict` returns such a dict.
 
         Args:
-            content: as JSON has it.
-            source: where it comes from, for messages.
+            content: the dict, or another value that was read from JSON.
+            source: name of the file, for messages.
 
         Raises:
-            ValueError: if it is another kind of object, or for an impossible value.
+            ValueError: if ``content`` is not such a dict, or has an impossible value.
         """
         what = f"{source}: not a plan in JSON"
         if not isinstance(content, dict):
@@ -324,15 +324,15 @@ class Plan:
         """Read a plan that :meth:`to_json` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for an impossible value.
+            ValueError: if the file is of another kind, or has an impossible value.
         """
         return cls.of_dict(read_json(Path(path)), str(path))
 
     def to_lines(self) -> list[list[Any]]:
         """Return the values of :data:`COLUMNS` for each box, in order, then for each empty bin.
 
-        Each line says the size of its bin and the unit (``unit_mm``, empty for abstract cells), so
-        that a reader needs nothing else. An empty bin has no values of a box.
+        Each line contains the size of its bin and the unit (``unit_mm``, empty for abstract cells),
+        so it can be read alone. In the line of an empty bin, the values of a box are empty.
         """
         unit = "" if self.unit_mm is None else self.unit_mm
         sizes = self.bin_sizes.tolist()
@@ -348,11 +348,11 @@ class Plan:
         """Return the plan of the lines of a CSV file.
 
         Args:
-            lines: as :meth:`to_lines` returns them, all values as text.
-            source: where they come from, for messages.
+            lines: the lines that :meth:`to_lines` returns, with all values as text.
+            source: name of the file, for messages.
 
         Raises:
-            ValueError: if they are other lines, or for an impossible value.
+            ValueError: if the lines are of another kind, or have an impossible value.
         """
         sizes: dict[int, list[Any]] = {}
         rows, units = [], set()
@@ -388,17 +388,17 @@ class Plan:
         """Read a plan that :meth:`to_csv` wrote.
 
         Raises:
-            ValueError: if it is another kind of file, or for an impossible value.
+            ValueError: if the file is of another kind, or has an impossible value.
         """
         path = Path(path)
         (_, header), *lines = list(read_lines(path)) or [(0, [])]
         if header != list(COLUMNS) or not lines:
-            raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and a line for a box")
+            raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and at least one line")
         return cls.of_lines([line for _, line in lines], str(path))
 
 
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
-    """Return numbers as a new array, an empty one in the shape that it needs."""
+    """Return numbers as a new array of ``shape``; refuse other shapes and infinite numbers."""
     array = np.array(values)
     array = array if array.size else array.reshape(shape)
     if array.shape != shape:
@@ -409,7 +409,7 @@ def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
 
 
 def _check_row(row: Sequence[Any], what: str) -> None:
-    """Refuse values of a box, in the order of :data:`BOX`, that are no numbers or no text."""
+    """Refuse a box whose values, in the order of :data:`BOX`, are not numbers where needed."""
     for key, value in zip(BOX, row, strict=True):
         if key in ("bin", "orientation"):
             whole_number(value, f"{what}: {key}", -1)
@@ -418,5 +418,5 @@ def _check_row(row: Sequence[Any], what: str) -> None:
 
 
 def _volume(sides: Array) -> float:
-    """Return the volume of all boxes [n, 3]; their product may exceed 64 bits."""
+    """Return the total volume of boxes [n, 3], as a float because int64 may overflow."""
     return float(sides.astype(np.float64).prod(1).sum())

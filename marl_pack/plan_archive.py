@@ -1,10 +1,10 @@
 """Archives of many plans, one for each episode: the files that ``evaluate --save-stacks`` writes.
 
-The ending of the file says what it is:
+The ending of the file's name says the format:
 
-- ``.npz``: NumPy arrays, the smallest and fastest to read;
-- ``.json``: an object with ``policy`` and ``plans``, each an ``episode`` beside the keys of
-  :meth:`marl_pack.plan.Plan.to_dict`;
+- ``.npz``: NumPy arrays, the smallest format and the fastest to read;
+- ``.json``: an object with ``policy`` and ``plans``; each plan has the key ``episode`` and the keys
+  of :meth:`marl_pack.plan.Plan.to_dict`;
 - ``.csv``: a line for each box, with ``policy`` and ``episode`` before the columns of
   :meth:`marl_pack.plan.Plan.to_lines`.
 
@@ -27,7 +27,7 @@ from marl_pack.inputs import read_arrays, read_json, read_lines
 from marl_pack.items.names import check_names
 from marl_pack.plan import COLUMNS, UNIT, Plan
 
-NOT_PLANS = "not a file of plans, as evaluate --save-stacks writes it"
+NOT_PLANS = "not a file of plans from evaluate --save-stacks"
 REQUIRED = ("bin", "count", "boxes", "loads")
 NAMES = (*REQUIRED, "utilization", "orientations", "ids", "bins", UNIT)
 """Names of the arrays of an archive."""
@@ -37,7 +37,12 @@ OF_PLAN = ("policy", "episode")
 
 
 def check_ending(path: Path, option: str) -> None:
-    """Raise ValueError unless the ending of a file of plans says what it is."""
+    """Raise ValueError unless the ending of ``path`` is one of :data:`ENDINGS`.
+
+    Args:
+        path: a file of plans.
+        option: the option that was given this path, for the message.
+    """
     if path.suffix.lower() not in ENDINGS:
         raise ValueError(f"{option} {path}: needs one of the endings {', '.join(ENDINGS)}")
 
@@ -46,9 +51,9 @@ def save_plans(path: Path, plans: Sequence[Plan], policy: str = "") -> None:
     """Save plans as ``.json``, ``.csv`` or, with any other ending, as ``.npz``.
 
     Args:
-        path: of the file.
-        plans: one for each episode, from 0 on.
-        policy: who packed them; ``.npz`` does not hold it.
+        path: the file to write.
+        plans: one plan for each episode, in order from episode 0.
+        policy: name of the policy that packed the boxes; ``.npz`` files do not store it.
 
     Raises:
         ValueError: if there are no plans.
@@ -67,14 +72,14 @@ def save_plans(path: Path, plans: Sequence[Plan], policy: str = "") -> None:
 
 
 def save_plan(path: Path, plan: Plan) -> None:
-    """Save one plan by the ending of the file: alone in JSON and CSV, as an archive of one else."""
+    """Save one plan as ``.json`` or ``.csv``; with any other ending, as an archive of one plan."""
     writers = {".json": plan.to_json, ".csv": plan.to_csv}
     write = writers.get(path.suffix.lower(), lambda path: save_plans(path, [plan]))
     write(path)
 
 
 def _save_arrays(path: Path, plans: Sequence[Plan]) -> None:
-    """Save plans as ``.npz``, rows past a plan's number of boxes filled with zeros.
+    """Save plans as ``.npz``; rows after a plan's last box are filled with zeros.
 
     The arrays are ``bin`` ([3], or [E, B, 3] unless every plan has one bin of the same size),
     ``count`` [E], ``boxes`` [E, M, 6], ``loads`` [E, M, 3], ``utilization`` [E], ``orientations``,
@@ -104,16 +109,16 @@ def _padded(rows: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Stack arrays [n, …] of different n as [E, M, …], filled with zeros."""
     most = max(1, *map(len, rows))
     table = np.zeros((len(rows), most, *rows[0].shape[1:]), np.result_type(*rows))
-    for filled, own in zip(table, rows, strict=True):
-        filled[: len(own)] = own
+    for padded, row in zip(table, rows, strict=True):
+        padded[: len(row)] = row
     return table
 
 
 def load_plans(path: str | Path) -> list[Plan]:
-    """Read an archive of plans, or a single plan that is a file of its own.
+    """Read an archive of plans, or a file of a single plan.
 
     Raises:
-        ValueError: if it is another kind of file, or for an impossible value.
+        ValueError: if the file is of another kind, or has an impossible value.
     """
     path = Path(path)
     if path.suffix.lower() == ".json":
@@ -135,8 +140,8 @@ def _load_json(path: Path) -> list[Plan]:
     for e, each in enumerate(content["plans"]):
         if not isinstance(each, dict) or each.get("episode") != e:
             raise ValueError(f"{path}: plan {e}: needs an object whose episode is {e}")
-        own = {key: value for key, value in each.items() if key != "episode"}
-        plans.append(Plan.of_dict(own, f"{path}: episode {e}"))
+        fields = {key: value for key, value in each.items() if key != "episode"}
+        plans.append(Plan.of_dict(fields, f"{path}: episode {e}"))
     return plans
 
 
@@ -147,7 +152,7 @@ def _load_csv(path: Path) -> list[Plan]:
         return [Plan.from_csv(path)]
     if header != [*OF_PLAN, *COLUMNS] or not lines:
         needs = ",".join((*OF_PLAN, *COLUMNS))
-        raise ValueError(f"{path}: {NOT_PLANS}: needs the columns {needs} and a line for a box")
+        raise ValueError(f"{path}: {NOT_PLANS}: needs the columns {needs} and at least one line")
     plans: list[Plan] = []
     for episode, group in groupby((line for _, line in lines), lambda line: line[1:2]):
         if episode != [str(len(plans))]:
@@ -155,13 +160,13 @@ def _load_csv(path: Path) -> list[Plan]:
                 f"{path}: needs the boxes of episode {len(plans)} together and before those of "
                 f"{shown(episode[0] if episode else '')}"
             )
-        own = [line[len(OF_PLAN) :] for line in group]
-        plans.append(Plan.of_lines(own, f"{path}: episode {len(plans)}"))
+        boxes = [line[len(OF_PLAN) :] for line in group]
+        plans.append(Plan.of_lines(boxes, f"{path}: episode {len(plans)}"))
     return plans
 
 
 def _load_arrays(path: Path) -> list[Plan]:
-    """Read plans from NumPy arrays, also from those without orientations, ids, bins and units."""
+    """Read plans from NumPy arrays; orientations, ids, bins and units may be missing."""
     try:
         arrays = read_arrays(path)
         check_names(arrays, NAMES, REQUIRED, str(path), "array")

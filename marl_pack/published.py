@@ -1,7 +1,7 @@
-"""The trained models and the settings that are published with the package, by name.
+"""Find the trained models and the settings that come with the package by their names.
 
-A model's name is a word such as ``rs``; that of settings is ``quick`` or ``ablations/joint``. What
-has a folder or a suffix is a path, as ``./NAME`` is.
+A model has a name such as ``rs``. Settings have a name such as ``quick`` or ``ablations/joint``.
+Any other text with a folder or a suffix, such as ``./NAME``, is a path.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def configs() -> list[str]:
 
 
 def is_path(source: str) -> bool:
-    """Return whether a text is a path and no name: it has a folder or a suffix."""
+    """Return whether a text is a path and not a name: it has a folder or a suffix."""
     return os.path.basename(source) != source or "." in source or not source
 
 
@@ -40,10 +40,10 @@ def model(source: str | Path, others: Sequence[str] = ()) -> Path:
 
     Args:
         source: a published model's name, or the path of a run's folder or a checkpoint.
-        others: names that are valid where it was given, for the message.
+        others: other names that the caller accepts, for the message.
 
     Raises:
-        ValueError: for a name that is none of a published model.
+        ValueError: if no published model has this name.
     """
     if not isinstance(source, str) or is_path(source):
         return Path(source)
@@ -59,7 +59,7 @@ def config(source: str) -> Path:
         source: the name of published settings, or a path.
 
     Raises:
-        ValueError: for a name that is none of theirs.
+        ValueError: if no published settings have this name.
     """
     if source in configs():
         return CONFIGS / f"{source}.yaml"
@@ -69,7 +69,7 @@ def config(source: str) -> Path:
 
 
 def _unknown(name: str, names: Sequence[str], path: str) -> ValueError:
-    """Return the error that lists the valid names, and says which one was probably meant."""
+    """Return the error that lists the valid names and suggests the nearest one."""
     near = f"./{name}" if os.path.exists(name) else renamed.nearest(name, names)
     guess = renamed.did_you_mean(near) if near else ""
     return ValueError(f"{shown(name)}: needs one of {', '.join(names)}, or a path to {path}{guess}")

@@ -1,4 +1,4 @@
-"""Old names and what they are called now, removed settings, and the nearest valid name."""
+"""Tables of old names and removed settings, and the search for the nearest valid name."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ PLANES = {
     "worth": "afterstate_value",
     "solid": "grounded",
 }
-"""Input planes of the networks (:data:`marl_pack.agents.networks.planes.PLANES`)."""
+"""Old → new name of input planes (:data:`marl_pack.agents.networks.planes.PLANES`)."""
 
 POLICIES = {"most_room": "max_feasible"}
-"""Names of heuristics (:data:`marl_pack.agents.keys.POLICIES`)."""
+"""Old → new name of heuristics (:data:`marl_pack.agents.keys.POLICIES`)."""
 
 AGENT_KEYS = {"imitate": "teacher", "imitate_iterations": "teacher_iterations"}
-"""Settings of an agent (:class:`marl_pack.config.Agent`)."""
+"""Old → new name of settings of an agent (:class:`marl_pack.config.Agent`)."""
 
 OPTIONS = {"size": "bin", "rule_parameters": "margin or thresholds"}
-"""Keyword arguments that games took (:class:`marl_pack.game.spec.GameSpec`)."""
+"""Old → new name of keyword arguments of games (:class:`marl_pack.game.spec.GameSpec`)."""
 
 
 class Removed(NamedTuple):
-    """A setting that was removed: the one value that still holds, and what that means."""
+    """A removed setting: the only value that is still accepted, and what this value means."""
 
     value: object
     now: str
@@ -41,7 +41,7 @@ REMOVED = {
 
 
 def removed(key: str) -> Removed | None:
-    """Return the record of the setting ``key``, with dots between sections; None if it is none."""
+    """Return the record of a removed setting, or None; ``key`` has dots between sections."""
     return REMOVED.get(".".join(key.split(".")[-2:]))
 
 
@@ -51,7 +51,7 @@ def nearest(name: str, valid: Iterable[str]) -> str | None:
 
 
 def did_you_mean(name: str | None) -> str:
-    """Return the end of a sentence that asks for the nearest valid name; empty without one."""
+    """Return the end of a sentence: a question about the name, or a full stop without a name."""
     return f"; did you mean {name!r}?" if name else "."
 
 
@@ -67,7 +67,7 @@ def refuse_old(name: str, names: Mapping[str, str], kind: str) -> None:
     Args:
         name: the name to check.
         names: old name → new name.
-        kind: the kind of thing that it names, for the message.
+        kind: what the name stands for, such as an option; for the message.
     """
     if name in names:
         raise ValueError(f"{kind} {name!r} is now called {names[name]!r}")

@@ -1,7 +1,7 @@
-"""Print on the terminal: every program's output and errors, with foreign text made harmless.
+"""Print the output and the errors of all programs, with text from users made harmless.
 
-Names of policies, paths, texts of checkpoints and identifiers of items may hold anything. They are
-printed as they are: markup is not read, and characters that control a terminal show as escapes.
+Names of policies, paths, texts in checkpoints and ids of items may contain any characters. Markup
+in them is not interpreted, and characters that control a terminal are printed as escapes.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from marl_pack import renamed
 from marl_pack.checks import one_line, printable, shown
 
 PIPED_WIDTH = 1000
-"""Columns of output that is not a terminal's, so that no table is cut."""
+"""Width in columns of output that does not go to a terminal, so that no table is cut."""
 
 
 class _PlainConsole(Console):
-    """A console that shows every text as it is."""
+    """A console that does not interpret markup in texts."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Return the text with printable characters only, without reading markup."""
@@ -42,7 +42,7 @@ class _PlainConsole(Console):
 
 
 def make_console(**options: Any) -> Console:
-    """Return the console of a program; piped output is as wide as it needs to be."""
+    """Return the console of a program; piped output is wide enough for every table."""
     console = _PlainConsole(markup=False, emoji=False, **options)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = PIPED_WIDTH
@@ -50,7 +50,7 @@ def make_console(**options: Any) -> Console:
 
 
 class _Name(TextColumn):
-    """The name of a task, as it is."""
+    """The column with the name of a task, in which markup is not interpreted."""
 
     def render(self, task: Task) -> Text:
         """Return the name with printable characters only."""
@@ -58,7 +58,7 @@ class _Name(TextColumn):
 
 
 def make_progress(console: Console) -> Progress:
-    """Return a progress bar that is removed when the work is done; none in piped output."""
+    """Return a progress bar that is removed when the work is done; piped output has none."""
     return Progress(
         _Name(""), BarColumn(), MofNCompleteColumn(),
         TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True,
@@ -67,7 +67,7 @@ def make_progress(console: Console) -> Progress:
 
 
 def announce_compiling(console: Console) -> None:
-    """Say on a terminal when the first start has to compile code, which takes some seconds."""
+    """On a terminal, show a message if the first start compiles code, which takes seconds."""
     if console.is_terminal:
         from marl_pack.installation import announce_compiling  # imports Numba
 
@@ -75,7 +75,7 @@ def announce_compiling(console: Console) -> None:
 
 
 def make_status(console: Console, text: str) -> Status:
-    """Return a line that says what is being done until it is done; none in piped output."""
+    """Return a line that shows ``text`` while the work goes on; piped output has none."""
     return console.status(Text(printable(text)))
 
 
@@ -89,12 +89,13 @@ def _decimal(kind: type[int] | type[float], text: str) -> float:
 class Parser(argparse.ArgumentParser):
     """A parser of a command's options whose errors are one printable line.
 
-    The line says which name was probably meant. Numbers are decimal: Python's ``1_0`` is none.
+    The line suggests the name that was probably meant. Numbers must be decimal: ``1_0`` is refused,
+    although Python accepts it.
 
     Args:
-        notes: paragraphs to stand below the options, as they are.
-        examples: uses of the command, without its name.
-        **options: of :class:`argparse.ArgumentParser`.
+        notes: paragraphs below the options in the help; they are not wrapped.
+        examples: arguments that a user may give, without the command's name.
+        **options: arguments of :class:`argparse.ArgumentParser`.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class Parser(argparse.ArgumentParser):
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a value that is none of the choices."""
+        """Refuse a value that is not among the choices."""
         choices = list(action.choices or [value])
         if value not in choices:
             names = list(map(str, choices))
@@ -136,7 +137,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def below_options(program: str, notes: Sequence[str], examples: Sequence[str]) -> str:
-    """Return what stands below the options in a command's help: notes, then examples."""
+    """Return the text below the options in a command's help: notes, then examples."""
     uses = "\n".join(f"  {program} {example}" for example in examples)
     return "\n\n".join([*notes, *([f"examples:\n{uses}"] if uses else [])])
 

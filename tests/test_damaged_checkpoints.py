@@ -239,7 +239,7 @@ DAMAGED: list[tuple[Change, str]] = [
 """States that no game comes into."""
 
 FOREIGN: list[tuple[Change, str]] = [
-    (add("t", 1, 0), "of game 0: needs what the choices in it lead to"),
+    (add("t", 1, 0), "of game 0: needs the result of the choices in the state"),
     (add("episode", 4, 0), "stream of game 0: needs the items of its episode"),
     (add("episode", 2**62 + 1, 0), "episode of game 0"),
     (add("stream", 1, 3), "stream of game 3"),

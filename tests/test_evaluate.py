@@ -342,4 +342,4 @@ def test_boxes_without_a_bin_are_packed_into_that_of_the_training(
     assert "bin 10 x 10 x 10" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         evaluate.main(["--policy", "dblf", "--items", str(items)])
-    assert "boxes.csv: has no bin size of its own; give one, W D H" in capsys.readouterr().err
+    assert "boxes.csv: has no bin size; give one, W D H" in capsys.readouterr().err

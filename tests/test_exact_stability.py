@@ -98,7 +98,7 @@ def test_weights_of_boxes_that_are_masked_are_refused() -> None:
     maps = np.zeros((2, 2, 2), np.int64)
     maps[0] = 1
     weights = np.ma.masked_array([1.0], [True])
-    with pytest.raises(ValueError, match="weights: needs one number a box"):
+    with pytest.raises(ValueError, match="weights: needs one number for each of"):
         stable_mask("equilibrium", *maps, (1, 1, 1), 4, [[0, 0, 0, 2, 2, 1]], weights=weights)
 
 

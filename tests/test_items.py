@@ -492,8 +492,8 @@ def test_an_empty_cell_is_refused_with_its_line(tmp_path: Path) -> None:
         ({"upright": [False, True]}, r"row 1 .*in none of its orientations \[0, 1\]"),
         ({"orientations": [[0], [1, 0]]}, r"row 1 .*in none of its orientations \[0, 1\]"),
         ({"orientations": [[0], [0, 2]], "upright": [1, 1]}, "row 1 .*may only be 0 and 1"),
-        ({"weights": [1]}, "'weights' needs one value an item"),
-        ({"ids": "ab"}, "'ids' needs one value an item"),
+        ({"weights": [1]}, "'weights' needs one value for each item"),
+        ({"ids": "ab"}, "'ids' needs one value for each item"),
         ({"lengths": [3]}, "lengths need 1 whole numbers in 1 … 2"),
     ],
 )

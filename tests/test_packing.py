@@ -247,8 +247,8 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"com_offset": (0.6, 0, 0)}, "com_offset"),
         ({"alpha": float("nan")}, "alpha"),
         ({"bin": (40000, 10, 10)}, "at most 32767"),
-        ({"margin": 3.0}, "no item that begins an episode"),
-        ({"bin": (4, 9, 9), "items": [[9, 2, 2]], "orientations": (0,)}, "no item that begins"),
+        ({"margin": 3.0}, "no episode can begin"),
+        ({"bin": (4, 9, 9), "items": [[9, 2, 2]], "orientations": (0,)}, "no episode can begin"),
         *[({name: value}, rf"^{name}.*{NUMBER}")
           for name in ("n", "seed", "first_episode") for value in (1.5, 2.0, True, "3", -1)],
         ({"seed": 2**63}, f"seed: {NUMBER} from 0 to 9223372036854775807"),

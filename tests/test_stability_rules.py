@@ -282,7 +282,7 @@ def test_a_bound_rule_is_checked_like_a_named_one() -> None:
         ({"weight": -2.0}, "weight"),
         ({"boxes": [[0, 0, 1, 1, 1, 1]]}, "row 0 .*floats"),
         ({"boxes": [[0, 0, 0, 3, 1, 1]]}, "row 0 .*outside"),
-        ({"boxes": [[0, 0, 0, 1, 1, 1]]}, "need to make this heightmap"),
+        ({"boxes": [[0, 0, 0, 1, 1, 1]]}, "do not lead to this heightmap"),
         ({"weights": [1.0]}, "weights"),
     ],
 )

@@ -1,9 +1,8 @@
-"""Compare games with plain code around every placement: the mode ``MARL_PACK_CHECK=1``.
+"""Check games with simple code before and after every placement (``MARL_PACK_CHECK=1``).
 
-The truth is the table of boxes. From it alone the maps, the counts and the masks are computed
-again, one box and one window at a time, by :mod:`marl_pack.stability.reference` and, for the rule
-``equilibrium``, by the linear program of the whole stack. This is slow: it is for tests, and for
-the search for a fault.
+The maps, the counts and the masks are computed again from the table of boxes, one box and one
+window at a time, by :mod:`marl_pack.stability.reference` and, for the rule ``equilibrium``, by the
+linear program of the whole stack. This is slow; use it for tests and for debugging.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ Mask = NDArray[np.bool_]
 
 
 class Games(Protocol):
-    """What is compared of G games: their state, and the moves that were computed from it."""
+    """The parts of G games that are checked: their state and the moves computed from it."""
 
     spec: GameSpec
     state: GameState
@@ -62,15 +61,15 @@ def wanted() -> bool:
 
 
 def before(game: Games, orientation: Tensor, cell: Tensor) -> list[Table]:
-    """Compare the games before a placement; return the boxes that each bin must hold after it.
+    """Check the games before a placement; return the boxes that each bin must contain after it.
 
     Args:
         game: the games.
-        orientation: int64 [G], the choices.
-        cell: int64 [G].
+        orientation: int64 [G], the chosen orientations.
+        cell: int64 [G], the chosen cells.
 
     Raises:
-        AssertionError: with the first difference, or for a choice that is not legal.
+        AssertionError: naming the first difference, or a choice that is not legal.
     """
     check(game)
     bins, items = game.state.bins.to("cpu"), game.state.items
@@ -94,7 +93,7 @@ def before(game: Games, orientation: Tensor, cell: Tensor) -> list[Table]:
 
 
 def _ends_game(game: Games, g: int, orientation: int, cell: int) -> bool:
-    """Return whether a choice ends its game with nothing placed; refuse one that is not legal."""
+    """Return whether a choice ends its game without a placement; refuse an illegal choice."""
     mask = _array(game.moves.mask[g]).reshape(len(ORIENTATIONS), -1)
     real = 0 <= orientation < len(mask) and 0 <= cell < mask.shape[1]
     if real and not game.spec.mask_orientations and not mask[orientation].any():
@@ -105,10 +104,10 @@ def _ends_game(game: Games, g: int, orientation: int, cell: int) -> bool:
 
 
 def check_bins(bins: Bins, expected: list[Table]) -> None:
-    """Compare bins with the boxes that they must hold.
+    """Compare bins with the boxes that they must contain.
 
     Raises:
-        AssertionError: with the first difference.
+        AssertionError: naming the first difference.
     """
     bins = bins.to("cpu")
     for g, table in enumerate(expected):
@@ -119,10 +118,10 @@ def check_bins(bins: Bins, expected: list[Table]) -> None:
 
 
 def check(game: Games) -> None:
-    """Compare the bins and the legal moves of all games with what their boxes make.
+    """Check that the maps and the legal moves of all games follow from their boxes.
 
     Raises:
-        AssertionError: with the first difference: the game, the structure and the place.
+        AssertionError: naming the first difference: the game, the array and the index.
     """
     bins, items, spec = game.state.bins.to("cpu"), game.state.items.to("cpu"), game.spec
     item = game.legal.orient(game.state.items)
@@ -160,7 +159,7 @@ def check(game: Games) -> None:
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """Return the values of a tensor on any device."""
+    """Return the values of a tensor on any device as a NumPy array."""
     array: NDArray[Any] = values.cpu().numpy()
     return array
 
@@ -187,7 +186,7 @@ def _table(bins: Bins, g: int) -> Table:
 
 
 def _maps(boxes: NDArray[Any], size: Size, g: int = -1) -> tuple[Map, Map]:
-    """Return the heightmap and the empty map that boxes [K, ≥ 6] make, placed one by one.
+    """Return the heightmap and the empty map after boxes [K, ≥ 6] are placed one by one.
 
     Raises:
         AssertionError: for a box outside the bin, in another box or in the air.
@@ -209,7 +208,7 @@ def _maps(boxes: NDArray[Any], size: Size, g: int = -1) -> tuple[Map, Map]:
 
 
 def _check_bin(bins: Bins, g: int, table: Table) -> None:
-    """Compare one bin's maps and filled volume with what its boxes make."""
+    """Check that one bin's maps and filled volume follow from its boxes."""
     heights, empty = _maps(table, bins.size, g)
     _same(g, "heightmap", "x, y", bins.heightmap[g].numpy(), heights)
     _same(g, "empty_map", "x, y", bins.empty_map[g].numpy(), empty)
@@ -219,7 +218,7 @@ def _check_bin(bins: Bins, g: int, table: Table) -> None:
     _same(g, "utilization", "", float(utilization(bins[g : g + 1])), share)
 
 
-@lru_cache(maxsize=2048)  # games come back to the same stacks: after a placement, before the next
+@lru_cache(maxsize=2048)  # each stack is checked twice: after a placement and before the next one
 def _mask(
     rule: str,
     parameters: tuple[tuple[str, Any], ...],
@@ -230,8 +229,8 @@ def _mask(
     """Return the mask of an item in one orientation by the definition of a rule, bool [W, D].
 
     Args:
-        rule: its name.
-        parameters: names and values.
+        rule: the rule's name.
+        parameters: names and values of the rule's parameters.
         size: (W, D, H).
         rows: the boxes in the bin: x y z w d h, weight, centre x y.
         item: w d h along x y z, centre x y from the low corner, weight.
@@ -254,7 +253,7 @@ def _verdict(
     maps: tuple[Map, Map],
     item: tuple[Any, ...],
 ) -> Callable[[Any, int, int], bool]:
-    """Return the definition of a rule: (window, x, y) → whether the item stands there."""
+    """Return the function (window, x, y) → whether the item is stable there by a rule."""
     (heights, empty), boxes = maps, table[:, :6].astype(np.int64)
     centre, margin = (item[3], item[4]), parameters.get("margin", 0.0)
     if rule == "none":

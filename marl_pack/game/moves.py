@@ -1,8 +1,8 @@
-"""The legal actions of a game: which orientation, and which cell of the floor.
+"""The legal actions of a game: an orientation of the item, and a cell of the bin's floor.
 
-A placement is a pair of an orientation o (0 … 5) and a cell, the low corner (x, y) of the box,
-numbered ``x · D + y``. The pair itself is numbered ``o · W · D + cell``. Games, agents and
-environments compute these numbers only here.
+A placement is a pair of an orientation o (0 … 5) and a cell, the low corner (x, y) of the box. The
+cell has the number ``x · D + y``, the pair the number ``o · W · D + cell``. Only this module
+computes these numbers.
 """
 
 from __future__ import annotations
@@ -105,29 +105,32 @@ class Moves:
         return Moves(self.mask & chosen[:, :, None, None])
 
     def allows(self, orientation: Tensor, cell: Tensor) -> Tensor:
-        """Return whether placements (int64 [G] each) are legal, bool [G]; out of range is not."""
+        """Return whether placements (int64 [G] each, any numbers) are legal, bool [G]."""
         floor = self.floor
         near = orientation.clamp(0, len(ORIENTATIONS) - 1), cell.clamp(0, floor.cells - 1)
         legal = self.mask.flatten(1).gather(1, floor.pair(*near)[:, None]).squeeze(1)
         return legal & (near[0] == orientation) & (near[1] == cell)
 
     def least(self, key: Tensor) -> tuple[Tensor, Tensor]:
-        """Return orientation and cell of the least key [G, 6, W, D], the first of equals.
+        """Return each game's legal orientation and cell with the smallest key.
+
+        Args:
+            key: numbers [G, 6, W, D]. Among equal keys, the first one counts.
 
         Returns:
-            int64 [G] each; legal wherever there is a legal placement.
+            int64 [G] each; they are legal where the game has a legal placement.
         """
         worst = torch.inf if key.is_floating_point() else torch.iinfo(key.dtype).max
         return self.floor.split(torch.where(self.mask, key, worst).flatten(1).argmin(1))
 
     @staticmethod
     def gather(values: Tensor, orientation: Tensor, cell: Tensor | None = None) -> Tensor:
-        """Return the values [G, 6, …] of one orientation, and of one cell if given, of each game.
+        """Return each game's values for one orientation, or for one orientation and cell.
 
         Args:
             values: [G, 6, …], or [G, 6, W, D] if a cell is given.
-            orientation: int64 [G].
-            cell: int64 [G].
+            orientation: int64 [G], the orientation in each game.
+            cell: int64 [G], the cell in each game; None for all cells.
         """
         games = _numbers(len(values), values.device)
         if cell is None:
@@ -139,8 +142,8 @@ class LegalMoves:
     """Finds the legal placements of items under the options of a game.
 
     Args:
-        spec: the options.
-        device: of the tensors.
+        spec: the options of the game.
+        device: the device of the tensors.
     """
 
     def __init__(self, spec: GameSpec, device: torch.device) -> None:
@@ -150,9 +153,9 @@ class LegalMoves:
         self._allowed = self._allowed.to(device)  # [6]
 
     def orient(self, items: Items) -> OrientedItem:
-        """Return items in their six orientations; those that may not be chosen get zero sides.
+        """Return items in their six orientations; orientations that are not allowed get zero sides.
 
-        The game's options and the item's own attribute say which may be chosen.
+        The game's options and the item's attribute ``orientations`` say which are allowed.
         """
         oriented = orient_item(items.sides, items.weights, self.spec.com_offset)
         if self._barred:
@@ -167,7 +170,7 @@ class LegalMoves:
         Args:
             bins: G bins.
             items: the items [G].
-            lost: bool [G], games that an orientation without a legal cell has ended.
+            lost: bool [G], games that ended because an orientation without a legal cell was chosen.
         """
         mask = self.rule(bins, self.orient(items))
         if lost is not None and not self.spec.mask_orientations:
@@ -179,8 +182,8 @@ class LegalMoves:
     def choices(self, moves: Moves, items: Items) -> tuple[Tensor, Tensor]:
         """Return the orientations that may be chosen, and whether the game goes on.
 
-        Without ``mask_orientations`` all that the game and the item allow may be chosen, as long as
-        one of them has a legal cell.
+        Without ``mask_orientations``, every orientation that the game and the item allow may be
+        chosen, as long as at least one of them has a legal cell.
 
         Args:
             moves: the legal moves of the items.
@@ -239,7 +242,7 @@ def sides_compiled(sides: Tensor, orientation: Tensor) -> Tensor:
     """Return items' sides [G, 3] along x, y, z in orientations int64 [G], by a compiled loop.
 
     Raises:
-        IndexError: for an orientation that is none of 0 … 5.
+        IndexError: for an orientation that is not one of 0 … 5.
     """
     chosen = np.empty((len(sides), 3), np.int16)
     if not _write_sides(sides.numpy(), orientation.numpy(), TABLE, chosen):
@@ -248,6 +251,6 @@ def sides_compiled(sides: Tensor, orientation: Tensor) -> Tensor:
 
 
 def sides_tensor(sides: Tensor, orientation: Tensor) -> Tensor:
-    """Return what :func:`sides_compiled` does, in tensor code; a GPU does not name the error."""
+    """Return the same as :func:`sides_compiled`, in tensor code; a GPU raises no clear error."""
     axes = orientation_table(sides.device).index_select(0, orientation)  # refuses negative indices
     return sides.gather(1, axes)

@@ -1,11 +1,11 @@
-"""The rules of the packing game: G games at once, two turns an item.
+"""The rules of the packing game: G games are played at once, with two turns for each item.
 
 First the visible item of each game gets an orientation (:meth:`Packing.orient`), then a place
-(:meth:`Packing.place`). One mask [G, 6, W, D] is made when an item arrives and serves both turns:
-the orientation agent chooses among the orientations with a legal cell, the placement agent among
-the cells of the chosen one, so a legal orientation never leaves the placement without a legal cell.
-An episode ends when the visible item has no legal cell in any orientation, when its stream has no
-more items, or when the bin holds as many as it may.
+(:meth:`Packing.place`). One mask [G, 6, W, D] is computed when an item arrives and is used in both
+turns. The orientation agent chooses among the orientations with a legal cell, the placement agent
+among the legal cells of this orientation. So after a legal orientation there is always a legal
+cell. An episode ends when the visible item has no legal cell in any orientation, when its stream
+has no more items, or when the bin contains the largest number of items allowed.
 """
 
 from __future__ import annotations
@@ -36,33 +36,35 @@ from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
 
 MOST_GAMES = 1 << 20
-"""The most games that are played at once."""
+"""The largest number of games that can be played at once."""
 MOST_SKIPPED = 1000
-"""Episodes in a row whose first item has no legal place, before the game gives up."""
+"""Number of episodes in a row without a legal cell for the first item, after which the game gives
+up."""
 LAST_EPISODE = 2**62
-"""The largest number of an episode."""
+"""The largest number that an episode can have."""
 
 
 @document(" " * 8)
 class Packing(Copied):
     """G games, each with one bin and its own conveyor.
 
-    An episode whose first item has no legal cell in the empty bin is over before it begins: it is
-    skipped with ``auto_reset``, and leaves its game ended without.
+    An episode whose first item has no legal cell in the empty bin cannot be played. With
+    ``auto_reset`` it is skipped; without, its game has ended.
 
     Attributes:
         spec: the options of the game.
-        state: all that the rest of the games depends on (:class:`marl_pack.game.state.GameState`).
+        state: everything that the rest of the games depends on
+            (:class:`marl_pack.game.state.GameState`).
         bins, items, t, episode: parts of the state.
         moves: the legal placements (:class:`marl_pack.game.moves.Moves`).
         mask: bool [G, 6, W, D], where the item may be placed in each orientation.
         orientation_mask: bool [G, 6], the orientations that may be chosen: those with a legal cell.
         alive: bool [G], false where an episode has ended (only without ``auto_reset``).
-        turn: an object that stands for this turn of these games: it changes with the masks.
-        checked: whether every placement is compared with plain code, which is slow
+        turn: an object that identifies this turn of these games; every turn has a new one.
+        checked: whether every placement is checked with simple code, which is slow
             (:mod:`marl_pack.game.invariants`).
-        orientation_sets: which orientations items may take in this game, with the share of items
-            that may take exactly those.
+        orientation_sets: the sets of orientations that items may take in this game, each with the
+            share of the items that have exactly this set.
         n, size, volume, floor: G, (W, D, H), W · D · H, and the numbers of cells and pairs.
         bin_height: int16 [G, 1], H.
 
@@ -71,19 +73,19 @@ class Packing(Copied):
         bin: size (W, D, H) in cells; an option of the game, as below.
         items: ``"rs"``, ``"cut1"``, ``"cut2"``, a file, an array, items or a stream
             (:func:`marl_pack.items.make_stream`).
-        spec: options of the game; by default the usual ones.
+        spec: options of the game; by default ``GameSpec()``.
         sides: shortest and longest side of generated items.
-        auto_reset: begin a new episode in a game as soon as one ends there. Without it a game that
-            has ended does not change, its mask stays empty and its actions are ignored.
-        device: where all tensors live.
+        auto_reset: begin a new episode in a game as soon as its episode ends. Without it, a game
+            that has ended does not change: its mask is empty and its actions are ignored.
+        device: the device of all tensors.
         backend: compiled loops or tensor code; by default the faster one on the device.
-        seed: of the item streams.
+        seed: seed of the item streams.
         first_episode: game g plays the episodes ``first_episode + g``, then every G-th after it.
-        **options: options of the game, changed from ``spec``:
+        **options: options of the game that replace those in ``spec``:
         {options}
 
     Raises:
-        ValueError, TypeError: if an argument is impossible; says what would be right.
+        ValueError, TypeError: if an argument is impossible; the message says what would be right.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class Packing(Copied):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Packing:
         """Return games that continue exactly as these do; only the item stream is shared."""
-        memo[id(self.stream)] = self.stream  # pure functions of tables that never change
+        memo[id(self.stream)] = self.stream  # a stream never changes
         copied = memo[id(self)] = object.__new__(type(self))
         vars(copied).update(copy.deepcopy(vars(self), memo))
         return copied
@@ -135,7 +137,7 @@ class Packing(Copied):
 
         Args:
             smallest: volume of the smallest item.
-            longest: items of the longest sequence, if sequences end.
+            longest: number of items in the longest sequence; None if sequences do not end.
         """
         limits = (self.volume // smallest, longest, self.spec.max_items)
         return min(limit for limit in limits if limit is not None)
@@ -173,16 +175,16 @@ class Packing(Copied):
         """Empty all bins and begin the episodes ``first_episode + g``.
 
         Args:
-            seed: of the item streams; the last one by default.
-            first_episode: see above.
-            skip: go on to each game's next episode where the first item has no legal cell; by
-                default only with ``auto_reset``.
+            seed: seed of the item streams; by default the last seed.
+            first_episode: the episode of the first game.
+            skip: whether to skip episodes whose first item has no legal cell; by default only with
+                ``auto_reset``.
 
         Raises:
-            ValueError: for an impossible seed or episode, or if all episodes are skipped; nothing
-                has changed then.
+            ValueError: for an impossible seed or episode, or if all episodes are skipped. The games
+                have not changed then.
         """
-        before = dict(vars(self))
+        attributes = dict(vars(self))
         most = self._most_items(self.stream.smallest, self.stream.longest)
         try:
             if seed is not None:
@@ -192,7 +194,7 @@ class Packing(Copied):
             if self.auto_reset if skip is None else skip:
                 self._restart(~self.alive)
         except ValueError:
-            vars(self).update(before)
+            vars(self).update(attributes)
             raise
 
     def _start(self, episode: Tensor, most: int) -> None:
@@ -205,16 +207,17 @@ class Packing(Copied):
         self._find_moves()
 
     def _alias(self) -> Packing:
-        """Return games that share everything with these, to be given a state of their own."""
+        """Return games that share all attributes with these; the caller then replaces the state."""
         alias = object.__new__(type(self))
         vars(alias).update(vars(self))
         return alias
 
     def set_state(self, state: GameState) -> None:
-        """Put the games into a copy of a state, such as one of :meth:`GameState.select`.
+        """Put the games into a copy of a state, such as a result of :meth:`GameState.select`.
 
         Raises:
-            ValueError: if it is of other games, or no game comes into it; nothing has changed then.
+            ValueError: if the state belongs to other games, or no game can reach it. The games have
+                not changed then.
         """
         self.state.load(state.tensors())
         self._find_moves()
@@ -225,7 +228,7 @@ class Packing(Copied):
         return tensors | self._origin()
 
     def _origin(self) -> dict[str, Tensor]:
-        """Return numbers that differ between games of other items, options or seeds."""
+        """Return numbers that identify the items, the options and the seed of these games."""
         options = hashlib.blake2b(repr(self.spec.to_dict()).encode(), digest_size=7).digest()
         return {
             "items_fingerprint": torch.tensor(fingerprint(self.stream)),
@@ -236,17 +239,17 @@ class Packing(Copied):
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore a :meth:`state_dict` of games made with the same arguments.
 
-        The choices in it are played again, so it may come from a file that nobody vouches for.
+        The choices in it are played again to check it, so its file need not be trusted.
 
         Raises:
-            ValueError: if it is of other games, or they do not come into it; nothing has changed
-                then.
+            ValueError: if it belongs to other games, or these games cannot reach it. The games have
+                not changed then.
         """
         tensors = dict(tensors)
-        for name, own in self._origin().items():
-            given = tensors.pop(name, own)  # the games are played again in any case
-            same = isinstance(given, Tensor) and given.dtype == own.dtype
-            if not same or not torch.equal(given.cpu(), own):
+        for name, expected in self._origin().items():
+            number = tensors.pop(name, expected)  # the games are played again in any case
+            same = isinstance(number, Tensor) and number.dtype == expected.dtype
+            if not same or not torch.equal(number.cpu(), expected):
                 what = name.removesuffix("_fingerprint")
                 changed = "; was their file changed?" if what == "items" else ""
                 raise ValueError(f"state of another game: needs the {what} of this game{changed}")
@@ -256,7 +259,7 @@ class Packing(Copied):
         self._find_moves()
 
     def _check_origin(self, state: GameState) -> None:
-        """Refuse a state that the choices in it, played again in these games, do not lead to.
+        """Play the choices in a state again, and refuse the state if they do not lead to it.
 
         Raises:
             ValueError: naming the first game and tensor that are wrong.
@@ -290,7 +293,7 @@ class Packing(Copied):
                 wrong &= ~torch.isclose(value, other, rtol=1e-12, atol=0)
             if name.removeprefix("bins.") in bin_state.ROWS:
                 wrong &= real[..., None]
-            refuse_where(wrong, name, "what the choices in it lead to")
+            refuse_where(wrong, name, "the result of the choices in the state")
 
     def branch(
         self,
@@ -304,17 +307,20 @@ class Packing(Copied):
         They do not restart when they end.
 
         Args:
-            games: int64 [K], the games to copy, each from 0 to G - 1; one may come several times.
-            stream: of the items after the visible ones; this game's by default. If its ids have
-                other texts, the boxes that the copies begin with have no ids in :meth:`plans`.
-            seed, episodes: int64 [K], the episodes of ``stream`` that come.
+            games: int64 [K], numbers of the games to copy, from 0 to G - 1; a number may occur
+                several times.
+            stream: brings the items after the visible ones; by default this game's stream. If its
+                ids have other texts, the boxes that are already placed have no ids in
+                :meth:`plans`.
+            seed: seed of ``stream``.
+            episodes: int64 [K], the episode of ``stream`` for each copy.
 
         Raises:
             ValueError: if the numbers of games or episodes are impossible.
         """
         if not isinstance(games, Tensor) or games.dtype != torch.int64 or games.dim() != 1:
             raise ValueError(f"games: needs int64 [K], numbers of games, not {described(games)}")
-        known = self.device.type == "cpu" and len(games) > 0  # another device would be waited for
+        known = self.device.type == "cpu" and len(games) > 0  # on another device this would wait
         if known and not 0 <= int(games.min()) <= int(games.max()) < self.n:
             raise ValueError(f"games: needs numbers of games from 0 to {self.n - 1}")
         branched = self._alias()
@@ -326,7 +332,7 @@ class Packing(Copied):
             if not isinstance(episodes, Tensor) or episodes.shape != games.shape:
                 raise ValueError(f"episodes: a stream needs one for each of {len(games)} games")
             branched.stream = stream
-            # A search plays negative seeds, which no user may give.
+            # A search uses negative seeds, which users may not give.
             branched.seed = whole_number(seed, "seed", -1 - LARGEST_SEED, LARGEST_SEED)
             branched.orientation_sets = _orientation_sets(stream, self.spec)
             most = self._most_items(min(self.stream.smallest, stream.smallest), None)
@@ -350,21 +356,24 @@ class Packing(Copied):
     # --- a turn -----------------------------------------------------------------------------------
 
     def orient_item(self, items: Items) -> OrientedItem:
-        """Return items in their six orientations; those that may not be chosen get zero sides."""
+        """Return items in their six orientations; orientations that are not allowed get zero sides.
+
+        See :meth:`marl_pack.game.moves.LegalMoves.orient`.
+        """
         return self.legal.orient(items)
 
     def orient(self, orientation: Tensor, *, check: bool = True) -> Oriented:
         """Return each item in an orientation, with its legal cells: the first turn.
 
-        It changes nothing in the game.
+        The games do not change.
 
         Args:
             orientation: int64 [G], indices into :data:`marl_pack.geometry.ORIENTATIONS`.
-            check: whether to check the range on another device than the CPU, which waits for it.
-                On the CPU the check costs nothing and is always made.
+            check: whether to check the range on a GPU; the program waits for this check. On the
+                CPU the check costs nothing and is always made.
 
         Raises:
-            ValueError: unless they are indices 0 … 5, one for each game.
+            ValueError: unless the orientations are indices 0 … 5, one for each game.
         """
         self._check_choice("orientation", orientation)
         if check and self.device.type != "cpu":
@@ -414,12 +423,12 @@ class Packing(Copied):
 
         Args:
             orientation: int64 [G], as in :meth:`orient`.
-            cell: int64 [G], low corners (:class:`marl_pack.game.moves.Floor`).
-            check: whether to check that the choices are legal. Leave it out only for choices taken
-                from the mask: an illegal one makes the state invalid.
+            cell: int64 [G], cell numbers of the low corners (:class:`marl_pack.game.moves.Floor`).
+            check: whether to check that the choices are legal. Pass False only for choices taken
+                from the mask: an illegal choice makes the state invalid.
 
         Raises:
-            ValueError: if a choice is not legal; then nothing has changed.
+            ValueError: if a choice is not legal. The games have not changed then.
         """
         self._check_choice("orientation", orientation)
         self._check_choice("cell", cell)
@@ -451,7 +460,7 @@ class Packing(Copied):
         if expected is not None:
             invariants.check_bins(state.bins, expected)
 
-        # A game that has ended keeps the item that had no place, and so its empty mask.
+        # A game that has ended keeps the item without a legal cell, and so its empty mask.
         state.t = state.t + played
         state.items = self.stream.item(state.stream, state.t)
         self._find_moves()
@@ -484,17 +493,17 @@ class Packing(Copied):
     # --- masks and episodes -----------------------------------------------------------------------
 
     def _find_moves(self) -> None:
-        """Find the legal moves of the visible items; a game without any has ended."""
+        """Find the legal moves of the visible items; a game without a legal move has ended."""
         self.turn = object()
         state = self.state
         self.moves = self.legal.moves(state.bins, state.items, state.lost)
         self.orientation_mask, self.alive = self.legal.choices(self.moves, state.items)
 
     def _restart(self, ended: Tensor) -> None:
-        """Begin the next episode with a legal first item in the games that have ended, bool [G].
+        """Begin the next episode with a legal first item in the games ``ended``, bool [G].
 
         Raises:
-            ValueError: if there is none within :data:`MOST_SKIPPED` episodes.
+            ValueError: if :data:`MOST_SKIPPED` episodes in a row have no such item.
         """
         begin = self.backend.pick(compiled=self._begin_some, tensor=self._begin_by_mask)
         for _ in range(MOST_SKIPPED):
@@ -504,9 +513,9 @@ class Packing(Copied):
             ended = ended & ~self.alive
         first = self.items.sides[int(ended.nonzero()[0])].tolist()
         raise ValueError(
-            f"no item that begins an episode has a place: one such as {first} may be placed "
-            f"nowhere in the empty bin {self.size}: check the orientations allowed "
-            f"{self.spec.orientations}, the rule's margin and com_offset"
+            f"no episode can begin: a first item such as {first} has no legal cell in the empty "
+            f"bin {self.size}; check the allowed orientations {self.spec.orientations}, the rule's "
+            "margin and com_offset"
         )
 
     def _begin_some(self, ended: Tensor) -> None:
@@ -520,13 +529,13 @@ class Packing(Copied):
         state.stream[games] = self.stream.start(self.seed, state.episode[games])
         items = self.stream.item(state.stream[games], state.t[games])
         moves = self.legal.moves(self._empty[: len(games)], items)
-        for own, new in zip(state.items.tensors().values(), items.tensors().values(), strict=True):
-            own[games] = new
+        for old, new in zip(state.items.tensors().values(), items.tensors().values(), strict=True):
+            old[games] = new
         self.mask[games] = moves.mask
         self.orientation_mask[games], self.alive[games] = self.legal.choices(moves, items)
 
     def _begin_by_mask(self, ended: Tensor) -> None:
-        """Begin the next episode where ``ended``, with fixed shapes, so that no device waits."""
+        """Begin the next episode where ``ended``; tensor shapes are fixed, so no device waits."""
         state = self.state
         state.episode = torch.where(ended, state.episode + self.n, state.episode)
         state.t = state.t.masked_fill(ended, 0)
@@ -549,7 +558,7 @@ def _orientation_sets(stream: Stream, spec: GameSpec) -> dict[tuple[int, ...], f
 
 
 def _backend_of(backend: Backend | None, device: torch.device) -> Backend:
-    """Return the backend, the device's default if None; refuse one that cannot work there."""
+    """Return the backend, or the device's default for None; refuse one that cannot use it."""
     if backend is None:
         return default_backend(device)
     if not isinstance(backend, Backend):

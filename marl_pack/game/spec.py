@@ -1,8 +1,7 @@
 """The options of a game, each listed once: :class:`GameSpec`.
 
-Settings files, command lines, the PettingZoo environment, checkpoints and the words that describe
-a game derive from the fields of this record. A new option is one field here, and the code that uses
-it.
+Settings files, command lines, the PettingZoo environment, checkpoints and descriptions of games use
+the fields of this record. A new option needs one field here, and the code that uses it.
 """
 
 from __future__ import annotations
@@ -37,12 +36,13 @@ def _option(
     """Return the field of one option.
 
     Args:
-        default: its value unless another is given.
-        sentence: what it does, with its range.
-        check: returns the value in its right type; raises ValueError saying what would be right.
-        phrase: the value → words that describe it.
-        **argument: of ``argparse.add_argument``, beside its name and its help; with ``flag`` in
-            place of the name where that differs.
+        default: the default value.
+        sentence: what the option does, with its range.
+        check: a function that returns the value in the right type, or raises ValueError saying what
+            would be right.
+        phrase: a function that describes the value in a few words.
+        **argument: arguments of ``argparse.add_argument`` except the name and the help; ``flag``
+            is the name on the command line if it differs from the option's name.
     """
     metadata = {"sentence": sentence, "check": check, "phrase": phrase, "argument": argument}
     return field(default=default, metadata=metadata)
@@ -86,7 +86,7 @@ def _margin(value: Any) -> float | None:
 
 
 def _listed(value: Any) -> list[Any]:
-    """Return the values in a list, tuple, set or array; none for texts, bytes and mappings."""
+    """Return the values in a list, tuple, set or array; [] for texts, bytes and mappings."""
     no_list = (str, bytes, bytearray, Mapping)
     try:
         return [] if isinstance(value, no_list) else list(value)
@@ -131,8 +131,8 @@ def _rule_name(rule: Any) -> str:
 class GameSpec:
     """Every option of a packing game.
 
-    Not among them: where items come from, the device, the seed, and whether episodes restart by
-    themselves (:class:`marl_pack.game.packing.Packing` takes those).
+    The items, the device, the seed and the automatic restart of episodes are not options of a game;
+    they are arguments of :class:`marl_pack.game.packing.Packing`.
 
     Args:
         {options}
@@ -159,13 +159,13 @@ class GameSpec:
         metavar="NAME",
     )  # fmt: skip
     orientations: tuple[int, ...] = _option(
-        ALL_ORIENTATIONS, "indices of the orientations that may be chosen, of 0 to 5.",
+        ALL_ORIENTATIONS, "indices of the allowed orientations, from 0 to 5.",
         _orientations, lambda chosen: f"orientations {' '.join(map(str, chosen))}",
         nargs="+", type=int, metavar="O",
     )  # fmt: skip
     mask_orientations: bool = _option(
-        True, "whether orientations without a stable cell are excluded; else choosing one ends the "
-        "episode.", lambda value: truth_value(value, "mask_orientations"),
+        True, "whether orientations without a stable cell are masked; if not, choosing one ends "
+        "the episode.", lambda value: truth_value(value, "mask_orientations"),
         lambda masked: "" if masked else "no mask of orientations",
         flag="orientation-mask", action=argparse.BooleanOptionalAction,
     )  # fmt: skip
@@ -178,13 +178,14 @@ class GameSpec:
         lambda beta: f"beta {beta:g}", type=float,
     )  # fmt: skip
     com_offset: tuple[float, float, float] = _option(
-        NO_OFFSET, "centre of mass of the items from their middle, in fractions of w, d, h.",
+        NO_OFFSET,
+        "offset of the items' centre of mass from their middle, in fractions of w, d, h.",
         _com_offset,
         lambda offset: f"centre of mass off by {' '.join(f'{o:g}' for o in offset)}",
         nargs=3, type=float, metavar=("X", "Y", "Z"),
     )  # fmt: skip
     max_items: int | None = _option(
-        None, "most items that a bin may hold, 1 or more; the episode ends there; null for no "
+        None, "largest number of items in a bin, 1 or more; the episode ends there; null for no "
         "limit.", _max_items, lambda most: f"at most {most} items", type=int,
     )  # fmt: skip
 
@@ -223,7 +224,7 @@ class GameSpec:
         """Return the spec with the options in ``values``; other keys are ignored.
 
         Args:
-            values: such as the section ``game`` of a run's settings.
+            values: name → value, such as the section ``game`` of a run's settings.
         """
         names = {option.name for option in fields(GameSpec)}
         return GameSpec(**{key: value for key, value in values.items() if key in names})
@@ -235,10 +236,10 @@ class GameSpec:
 
         Args:
             options: name → value.
-            taken: options that the caller takes by another name → that name.
+            taken: for options with another name in the caller: name → the caller's name.
 
         Raises:
-            TypeError: for a name that is no option, with the nearest one.
+            TypeError: for a name that is not an option; the message suggests the nearest option.
             ValueError: for an impossible value, or an old name.
         """
         names = [taken.get(option.name, option.name) for option in fields(GameSpec)]
@@ -251,7 +252,7 @@ class GameSpec:
         return replace(self, **options) if options else self
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the options by name, a bound rule by its function's name."""
+        """Return name → value of all options; a bound rule is its function's name."""
         return asdict(self) | {"rule": _rule_name(self.rule)}
 
     def phrases(self) -> list[str]:
@@ -268,7 +269,7 @@ class GameSpec:
 
 
 class GameOptions(TypedDict, total=False):
-    """The options of :class:`GameSpec` but the bin, as keyword arguments that editors know."""
+    """The options of :class:`GameSpec` except the bin, as typed keyword arguments."""
 
     rule: str | Rule
     margin: float | None
@@ -295,9 +296,9 @@ def document(indent: str) -> Callable[[T], T]:
         for option in fields(GameSpec)
     )  # fmt: skip
 
-    def documented(owner: T) -> T:
-        owner.__doc__ = (owner.__doc__ or "").replace("{options}", lines.strip())
-        return owner
+    def documented(target: T) -> T:
+        target.__doc__ = (target.__doc__ or "").replace("{options}", lines.strip())
+        return target
 
     return documented
 
@@ -306,10 +307,10 @@ def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) ->
     """Return a signature that names every option in place of ``**options``.
 
     Args:
-        signature: of what takes options.
+        signature: the signature of a function or class with ``**options``.
         leave_out: options that it takes by another name.
     """
-    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    others = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     options = [
         inspect.Parameter(
             option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default,
@@ -318,7 +319,7 @@ def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) ->
         for option in fields(GameSpec)
         if option.name not in leave_out
     ]  # fmt: skip
-    return signature.replace(parameters=[*own, *options])
+    return signature.replace(parameters=[*others, *options])
 
 
 def add_arguments(parser: argparse._ActionsContainer) -> None:

@@ -1,8 +1,8 @@
-"""The state of G games: all that the rest of a game depends on, listed once.
+"""The state of G games: everything that the rest of a game depends on.
 
-The letters of shapes: G games played at once, k visible items of each, b bins of each. The game of
-the paper has k = 1 and b = 1, so the tensors here have no axis for them: the visible item is
-``items`` [G], and game g packs bin g.
+Shapes use the letters G (games played at once), k (visible items of each game) and b (bins of each
+game). The game of the paper has k = 1 and b = 1, so the tensors here have no axis for k and b: the
+visible item is ``items`` [G], and game g packs bin g.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from marl_pack.items.items import Items
 
 
 class Copied:
-    """What copies continue exactly as it does, and share nothing that changes."""
+    """A base class whose copies continue exactly like the original and share no state with it."""
 
     def __copy__(self) -> Self:
-        """Return an independent copy: a view of the same game would not be one."""
+        """Return an independent copy; a shallow copy would share the game's state."""
         return copy.deepcopy(self)
 
 
@@ -33,7 +33,7 @@ class Copied:
 class GameState:
     """The state of G games in play; copying, selecting and saving derive from the fields."""
 
-    bins: Bins  # of G bins: game g packs bin g
+    bins: Bins  # the G bins: game g packs bin g
     items: Items  # [G], the visible item of each game; zero sides at the end of its sequence
     episode: Tensor  # int64 [G]   number of the episode
     t: Tensor  # int64 [G]         items that the episode has had before the visible one
@@ -55,38 +55,38 @@ class GameState:
         """Copy tensors into this state.
 
         Args:
-            tensors: as :meth:`tensors` names them.
+            tensors: all tensors, with the names that :meth:`tensors` uses.
 
         Raises:
-            ValueError: if one is missing, unknown or of another shape or type, or if no game can
-                come into this state; nothing has changed then.
+            ValueError: if a tensor is missing, unknown or of another shape or type, or if no game
+                can reach this state. Nothing has changed then.
         """
         self.copy_from(self.holding(tensors))
 
     def copy_from(self, state: GameState) -> None:
         """Copy the tensors of another state of the same shapes into this one."""
-        for own, tensor in zip(self.tensors().values(), state.tensors().values(), strict=True):
-            own.copy_(tensor)
+        for target, tensor in zip(self.tensors().values(), state.tensors().values(), strict=True):
+            target.copy_(tensor)
 
     def holding(self, tensors: Mapping[str, Tensor]) -> GameState:
-        """Return a state of the same games that holds other tensors; this one does not change.
+        """Return a new state of the same games with other tensors; this state does not change.
 
-        Args, Raises: as for :meth:`load`.
+        The arguments and the errors are those of :meth:`load`.
         """
-        own = self.tensors()
-        unknown = sorted(set(tensors) - set(own))
+        current = self.tensors()
+        unknown = sorted(set(tensors) - set(current))
         if unknown:
-            raise _of_another_game(f"this one has no {', '.join(unknown)}")
-        for name, tensor in own.items():
+            raise _of_another_game(f"this game has no {', '.join(unknown)}")
+        for name, tensor in current.items():
             if name not in tensors:
                 raise _of_another_game(f"{name} is missing, needs {list(tensor.shape)}")
-            given = tensors[name]
-            if not isinstance(given, Tensor):
-                raise _of_another_game(f"{name} is {shown(given)}, needs a tensor")
-            if given.shape != tensor.shape:
-                raise _of_another_game(f"{name} is {list(given.shape)}, needs {list(tensor.shape)}")
-            if given.dtype != tensor.dtype:
-                raise _of_another_game(f"{name} is {given.dtype}, needs {tensor.dtype}")
+            new = tensors[name]
+            if not isinstance(new, Tensor):
+                raise _of_another_game(f"{name} is {shown(new)}, needs a tensor")
+            if new.shape != tensor.shape:
+                raise _of_another_game(f"{name} is {list(new.shape)}, needs {list(tensor.shape)}")
+            if new.dtype != tensor.dtype:
+                raise _of_another_game(f"{name} is {new.dtype}, needs {tensor.dtype}")
         state = self.select(torch.arange(len(self), device=self.t.device))  # a copy
         for name, tensor in state.tensors().items():
             tensor.copy_(tensors[name])
@@ -94,7 +94,7 @@ class GameState:
         return state
 
     def check(self) -> None:
-        """Refuse a state that no game comes into: what is derived must follow from the boxes.
+        """Refuse a state that no game can reach: the maps must follow from the boxes.
 
         Raises:
             ValueError: naming the first game and tensor that are wrong, and what would be right.
@@ -121,7 +121,7 @@ class GameState:
         for name in ("heightmap", "empty_map", "filled", "boxes"):
             wrong = getattr(bins, name) != getattr(rebuilt, name)
             wrong = wrong & real[..., None] if name == "boxes" else wrong
-            refuse_where(wrong, f"bins.{name}", "what follows from the boxes, each on those below")
+            refuse_where(wrong, f"bins.{name}", "the result of placing the boxes in order")
         shape = (items.sides >= 1) & (items.sides <= longest)
         present = items.sides.any(1)
         refuse_where(present & ~shape.all(1), "items.sides", f"from 1 to {longest}, or zeros")

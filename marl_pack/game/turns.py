@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Oriented:
-    """What the placement turn is shown once an orientation is chosen."""
+    """The visible item in the chosen orientation, and its legal cells, for the placement turn."""
 
     sides: Tensor  # int16 [G, 3]    the item's sides along x, y, z
     mask: Tensor  # bool [G, W, D]   the cells where it may be placed
@@ -21,9 +21,9 @@ class Outcome:
 
     reward: Tensor  # float32 [G]   Eq. 5
     done: Tensor  # bool [G]        whether the episode ended with this placement
-    filled: Tensor  # int64 [G]     cells filled in the bin right after it, before any reset
-    placed: Tensor  # int64 [G]     boxes in the bin right after it
-    volume: int  # of a bin, in cells
+    filled: Tensor  # int64 [G]     cells filled in the bin after the placement, before any reset
+    placed: Tensor  # int64 [G]     boxes in the bin after the placement, before any reset
+    volume: int  # volume of a bin, in cells
 
     @property
     def utilization(self) -> Tensor:

@@ -17,11 +17,11 @@ ORIENTATIONS: tuple[tuple[int, int, int], ...] = (
 )
 """The six axis permutations of a box. Row ``o`` names which of the item's own sides
 (0 = w, 1 = d, 2 = h) lies along x, y and z. ``o // 2`` picks the side that stands upright
-(h, d, w), and ``o ^ 1`` is the same box rotated by 90° about the vertical. So 0 is the item as
-it comes, and {0, 1} are the two orientations that keep it upright."""
+(h, d, w), and ``o ^ 1`` is the same box rotated by 90° about the vertical. So orientation 0 is the
+item as it arrives, and the orientations 0 and 1 keep it upright."""
 
 ALL_ORIENTATIONS = tuple(range(len(ORIENTATIONS)))
-"""Numbers of the six orientations."""
+"""The numbers of the six orientations, 0 … 5."""
 
 MAX_HEIGHT = 16383
 """Height of the tallest bin in cells: masks compare ``2 · height + 1`` as 16-bit integers."""
@@ -33,7 +33,7 @@ def check_size(size: Size) -> Size:
     """Return a bin's ``size`` as three ints.
 
     Raises:
-        ValueError: unless it is three whole numbers from 1 to the largest allowed.
+        ValueError: unless it is three whole numbers from 1 to the largest size allowed.
     """
     try:
         sides = [real_number(side, "side") for side in size]

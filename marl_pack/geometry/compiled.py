@@ -16,19 +16,19 @@ from marl_pack.installation import njit
 def place_box(
     heightmap: Any, empty_map: Any, x: int, y: int, w: int, d: int, h: int
 ) -> tuple[int, int]:
-    """Place one box on its window from above, in place (Algorithm 2 for the empty map).
+    """Place one box from above and update both maps (Algorithm 2 for the empty map).
 
-    The box comes to rest on the highest column of its window.
+    The box comes to rest on the highest column of its window. The window must lie inside the map;
+    this is not checked.
 
     Args:
-        heightmap: integers [W, D], the top of each column.
-        empty_map: integers [W, D], the empty cells below each top; None where nobody needs it.
+        heightmap: integers [W, D], the top of each column; updated.
+        empty_map: integers [W, D], the empty cells below each top; updated. None if not needed.
         x: the window's low corner along W.
         y: the window's low corner along D.
-        w: the box's side along x, ≥ 1, as d along y and h along z. The window must lie inside the
-            map; this is not checked.
-        d: see ``w``.
-        h: see ``w``.
+        w: the box's side along x, ≥ 1.
+        d: the box's side along y, ≥ 1.
+        h: the box's side along z, ≥ 1.
 
     Returns:
         The resting height and the wasted cells (v_waste of Eq. 7): empty cells enclosed below the
@@ -51,7 +51,7 @@ def place_box(
 
 @njit(cache=True, inline="always")
 def _pairwise_max(a: Any, b: Any, out: Any) -> None:
-    """Write the larger of each two entries to ``out``."""
+    """Write the larger of ``a[i]`` and ``b[i]`` to ``out[i]``."""
     for i in range(out.size):
         out[i] = a[i] if a[i] > b[i] else b[i]
 
@@ -60,12 +60,13 @@ def _pairwise_max(a: Any, b: Any, out: Any) -> None:
 def slide(values: Any, spare: Any, out: Any, depth: int, w: int, d: int) -> Any:
     """Compute the maximum over the w × d window whose low corner is each entry of a flat map.
 
-    Takes O(log w + log d) passes, by doubling. Entries whose window leaves the map are undefined.
+    The window is doubled step by step, which takes O(log w + log d) passes. Entries whose window
+    leaves the map are undefined.
 
     Args:
         values: the map [W · D], or several maps one after the other.
-        spare: scratch of the same size and type.
-        out: scratch of the same size and type.
+        spare: scratch array of the same size and type.
+        out: scratch array of the same size and type.
         depth: D.
         w: the window's cells along x, ≥ 1.
         d: the window's cells along y, ≥ 1.
@@ -97,7 +98,7 @@ def mark_valid(valid: Any, width: int, depth: int, w: int, d: int, mark: int) ->
         depth: D.
         w: the window's cells along x, ≤ W.
         d: the window's cells along y, ≤ D.
-        mark: the number written.
+        mark: the number to write.
     """
     valid[:] = 0
     for x in range(width - w + 1):
@@ -113,9 +114,9 @@ def resting_heights_and_waste(
     Args:
         heightmap: int16 [N, W, D].
         sides: int16 [N, A, 3].
-        height: H, the resting height where the window does not lie inside the map.
+        height: H, written as the resting height where the window does not lie inside the map.
         resting_heights: int16 [N, A, W, D], written.
-        waste: int32 [N, A, W, D], written unless it is empty.
+        waste: int32 [N, A, W, D], written unless it has no entries.
     """
     n, width, depth = heightmap.shape
     cells = width * depth

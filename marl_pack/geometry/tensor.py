@@ -1,7 +1,7 @@
 """Windows and placements of boxes in batched tensor code, for any device.
 
-:mod:`marl_pack.geometry.compiled` has the same operations as compiled loops. A batch of B maps has
-a window of its own for each map.
+:mod:`marl_pack.geometry.compiled` has the same operations as compiled loops. In a batch of B maps,
+each map can have a window of another size.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ def oriented(items: Tensor) -> Tensor:
 
 
 def footprint(width: int, depth: int, sides: Tensor, corners: Tensor) -> Tensor:
-    """Return the columns under boxes, bool [N, W, D].
+    """Return which columns lie under each box, bool [N, W, D].
 
     Args:
         width: W.
         depth: D.
         sides: int [N, 3], the boxes' sides along x, y, z.
-        corners: int64 [N, 2], their low corners (x, y).
+        corners: int64 [N, 2], the boxes' low corners (x, y).
     """
     far = corners + sides[:, :2]
     rows = torch.arange(width, device=sides.device)
@@ -45,13 +45,13 @@ def footprint(width: int, depth: int, sides: Tensor, corners: Tensor) -> Tensor:
 def place_boxes(
     heightmap: Tensor, empty_map: Tensor, under: Tensor, heights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Place one box on each map from above, in place (Algorithm 2 for the empty map).
+    """Place one box on each map from above and update the maps (Algorithm 2 for the empty map).
 
     Each box comes to rest on the highest column below it.
 
     Args:
-        heightmap: int16 [N, W, D], the top of each column.
-        empty_map: int16 [N, W, D], the empty cells below each top.
+        heightmap: int16 [N, W, D], the top of each column; updated.
+        empty_map: int16 [N, W, D], the empty cells below each top; updated.
         under: bool [N, W, D], the columns under each box (:func:`footprint`).
         heights: int [N], the boxes' sides along z.
 
@@ -68,7 +68,10 @@ def place_boxes(
 
 
 def shift(values: Tensor, steps: Tensor, dim: int) -> Tensor:
-    """Return ``values`` [B, W, D] read ``steps`` [B] further along ``dim``, the edge repeated."""
+    """Shift maps [B, W, D]: each entry becomes the entry ``steps`` [B] further along ``dim``.
+
+    Past the edge, the last entry is repeated.
+    """
     length = values.shape[dim]
     index = torch.arange(length, device=values.device) + steps[:, None]
     index = index.clamp(0, length - 1)
@@ -168,10 +171,10 @@ def cut_windows(
 
     Args:
         values: [B, W, D].
-        index: int64 [U], the map of each window.
-        x: int64 [U], its low corner along W.
-        y: int64 [U], its low corner along D.
-        sides: int [U, ≥ 2], its sides w, d.
+        index: int64 [U], the index of each window's map.
+        x: int64 [U], each window's low corner along W.
+        y: int64 [U], each window's low corner along D.
+        sides: int [U, ≥ 2], each window's sides w, d.
 
     Returns:
         [U, w, d] for the largest w and d, and bool [U, w, d]: which cells belong to the window.

@@ -1,4 +1,4 @@
-"""Resting height and wasted cells of every window, by either backend."""
+"""Compute the resting height and the wasted cells of every window, with either backend."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def resting_heights_and_waste(
     waste: bool = True,
     backend: Backend | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Compute resting height and wasted cells of each box at every cell.
+    """Compute the resting height and the wasted cells of each box at every cell.
 
     Args:
         heightmap: int16 [N, W, D], the top of each column.
-        sides: int16 [N, A, 3], the boxes' sides along x, y, z; with a zero side nowhere inside.
-        height: H.
-        waste: whether to compute the wasted cells (else they have no entries).
-        backend: computes it; the device's default if None.
+        sides: int16 [N, A, 3], the boxes' sides along x, y, z; a box with a zero side fits nowhere.
+        height: the bin's height H.
+        waste: whether to compute the wasted cells; if not, the second result has no entries.
+        backend: the implementation to use; by default the faster one on the device.
 
     Returns:
-        int16 [N, A, W, D], resting heights, H where the window does not lie inside the map; and
-        int32 [N, A, W, D], wasted cells v_waste (Eq. 7), 0 there.
+        Resting heights int16 [N, A, W, D], which are H where the window does not lie inside the
+        map, and wasted cells v_waste (Eq. 7) int32 [N, A, W, D], which are 0 there.
     """
     chosen = default_backend(heightmap.device) if backend is None else backend
     return chosen.pick(compiled=_compiled, tensor=_tensor)(heightmap, sides, height, waste)

@@ -1,4 +1,4 @@
-"""Items to be packed: their attributes, streams that bring them, and files of them."""
+"""Items to be packed: their attributes, the streams that bring them, and files of items."""
 
 import lazy_loader
 

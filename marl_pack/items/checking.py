@@ -45,10 +45,10 @@ class Rows:
     sides: NDArray[Any]  # [R, 3]
     counts: NDArray[np.int64]  # [S]  number of rows in each sequence
     source: str
-    single: bool  # whether the items were given as one sequence [L, 3]
+    single: bool  # whether the user gave one sequence [L, 3]
 
     def refuse(self, wrong: NDArray[np.bool_], why: str) -> None:
-        """Raise ValueError with the first row where ``wrong`` is true, if there is one."""
+        """Raise ValueError about the first row where ``wrong`` [R] is true, if there is one."""
         if wrong.any():
             i = int(wrong.argmax())
             ends = self.counts.cumsum()
@@ -73,12 +73,14 @@ def check_items(
         items: whole numbers [L, 3] (one sequence) or [S, L, 3], rows w, d, h in cells; or a list of
             sequences of unequal length. Rows of zeros may only fill the end of a sequence.
         size: (W, D, H) of the bin that items must fit into, in one of their orientations.
-        lengths: whole numbers [S]; by default a sequence ends at its first row of zeros.
-        source: what to call the items in an error.
-        attributes: values of :data:`marl_pack.items.ATTRIBUTES` by key, one for each item, shaped
-            or listed as the items: ``weights``, positive, volumes by default; ``upright``, true for
-            orientations 0 and 1 only; ``orientations``, lists of numbers 0 … 5 or bool [..., 6];
-            ``ids``, texts or whole numbers; ``quantity``, how often the row is repeated in place.
+        lengths: whole numbers [S], the number of items in each sequence; by default a sequence
+            ends at its first row of zeros.
+        source: name of the items in error messages.
+        attributes: values of :data:`marl_pack.items.ATTRIBUTES` by key, one for each item, in the
+            same shape or nested lists as the items: ``weights``, positive, volumes by default;
+            ``upright``, true for only the orientations 0 and 1; ``orientations``, lists of numbers
+            0 … 5 or bool [..., 6]; ``ids``, texts or whole numbers; ``quantity``, how often the row
+            is repeated.
 
     Raises:
         ValueError: naming the sequence and row, or an unknown attribute.
@@ -121,7 +123,7 @@ def check_items(
 
 
 def split_sequences(items: Any, source: str) -> tuple[Sequence[Any] | NDArray[Any], bool]:
-    """Return the S sequences of rows, and whether they were given as one [L, 3].
+    """Return the S sequences of rows, and whether ``items`` are a single sequence [L, 3].
 
     Raises:
         ValueError: if ``items`` are neither [L, 3] nor [S, L, 3] nor a list.
@@ -154,7 +156,7 @@ def _is_list(values: object) -> bool:
 
 
 def _read_rows(items: Any, source: str) -> Rows:
-    """Return the rows of all sequences, with zeros after their ends if they are given."""
+    """Return the rows of all sequences, including any rows of zeros after their ends."""
     if isinstance(items, Ragged):
         return Rows(np.asarray(items.values), items.counts, source, single=False)
     sequences, single = split_sequences(items, source)
@@ -200,7 +202,7 @@ def _read_block(rows: Any, name: str) -> NDArray[np.float64]:
 
 
 def _is_row(row: Any) -> bool:
-    """Return whether ``row`` is three numbers of any value."""
+    """Return whether ``row`` is a list of three numbers of any value."""
     if not _is_list(row) or len(row) != 3:
         return False
     return all(isinstance(value, Real) and not isinstance(value, bool) for value in row)
@@ -227,7 +229,7 @@ def _ends(rows: Rows, lengths: Any) -> NDArray[np.int64]:
             )
         return numbers.astype(np.int64)
     blank = ~rows.sides.any(1)
-    if (counts == counts[0]).all():  # a grid, which may be mostly blank: spare its memory
+    if (counts == counts[0]).all():  # equal lengths; the rows may be mostly zeros
         grid = blank.reshape(-1, counts[0])
         ends = np.where(grid.any(1), grid.argmax(1), counts)
     else:
@@ -241,7 +243,7 @@ def _ends(rows: Rows, lengths: Any) -> NDArray[np.int64]:
 
 
 def _before(ends: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of the rows of sequences stand before the ends, bool [R]."""
+    """Return which rows lie before the end of their sequence, bool [R]."""
     if (counts == counts[0]).all():
         return (np.arange(counts[0]) < ends[:, None]).ravel()
     number = np.arange(counts.sum()) - (counts.cumsum() - counts).repeat(counts)
@@ -249,7 +251,7 @@ def _before(ends: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.bo
 
 
 def _check_sides(rows: Rows) -> None:
-    """Refuse sides that are no whole numbers of cells."""
+    """Refuse sides that are not whole numbers of cells."""
     problems = {
         "not a number": ~np.isfinite(rows.sides),
         "a fraction of a cell": rows.sides != np.floor(rows.sides),
@@ -262,17 +264,17 @@ def _check_sides(rows: Rows) -> None:
 def _read_attribute(
     attribute: Attribute, column: Any, inside: NDArray[np.bool_], rows: Rows
 ) -> NDArray[Any]:
-    """Return an attribute of the items [R', *shape].
+    """Return the values of one attribute of the items, [R', *shape].
 
     Args:
-        attribute: which one.
-        column: its values before and after the ends of sequences [R]; None: of another number.
-        inside: which of them stand before the ends, bool [R].
-        rows: those before the ends, for messages.
+        attribute: the attribute.
+        column: its values for all R rows; None if the number of values is wrong.
+        inside: which rows lie before the end of their sequence, bool [R].
+        rows: the R' rows before the ends, for messages.
     """
     if column is None:
         raise ValueError(
-            f"{rows.source}: {attribute.key!r} needs one value an item, shaped or listed as items"
+            f"{rows.source}: {attribute.key!r} needs one value for each item, nested like the items"
         )
     if isinstance(column, np.ndarray):
         column = column[inside]
@@ -285,9 +287,9 @@ def _read_attribute(
 
 
 def _flatten(values: Any, rows: Rows) -> list[Any] | NDArray[Any] | None:
-    """Return the values of all rows, one after the other; None if their number is another.
+    """Return the values of all rows, one after the other; None if their number is wrong.
 
-    A single sequence may have them as [L] or [1, L].
+    The values of a single sequence may have the shape [L] or [1, L].
     """
     if isinstance(values, Ragged):
         return values.values
@@ -307,7 +309,7 @@ def _flatten(values: Any, rows: Rows) -> list[Any] | NDArray[Any] | None:
 def _allowed(
     orientations: NDArray[np.bool_] | None, upright: NDArray[np.bool_] | None, rows: Rows
 ) -> NDArray[np.bool_]:
-    """Return the orientations that the items may take by both attributes, bool [R, 6]."""
+    """Return the orientations that both attributes allow for each item, bool [R, 6]."""
     stays_upright = np.isin(ALL_ORIENTATIONS, UPRIGHT)
     everything = np.ones((len(rows.sides), len(ALL_ORIENTATIONS)), bool)
     if upright is None:
@@ -320,21 +322,21 @@ def _allowed(
 
 
 def _check_fit(rows: Rows, allowed: NDArray[np.bool_], size: Size) -> None:
-    """Refuse an item that fits into the bin in none of its orientations."""
+    """Refuse an item that does not fit into the bin in any of its orientations."""
     short = rows.sides[:, :, None] <= np.array(size)  # [R, 3, 3]: side i along axis j
     in_bin = short[:, np.array(ORIENTATIONS), np.arange(3)].all(2)  # [R, 6]
     wrong = np.logical_not((in_bin & allowed).any(1))
-    own = np.flatnonzero(allowed[wrong.argmax()]).tolist()
-    which = "no orientation" if len(own) == 6 else f"none of its orientations {own}"
+    numbers = np.flatnonzero(allowed[wrong.argmax()]).tolist()
+    which = "no orientation" if len(numbers) == 6 else f"none of its orientations {numbers}"
     rows.refuse(wrong, f"fits into the bin {tuple(size)} in {which}")
 
 
 def number_ids(ids: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[str, ...] | None]:
-    """Return ids as whole numbers: the ids themselves, or indices into texts, returned as well.
+    """Return ids as whole numbers and None, or as indices into texts and these texts.
 
     Args:
-        ids: texts and whole numbers [R]. Texts such as "007" are not numbers, and negative numbers
-            are texts: a label below 0 says that an id is unknown.
+        ids: texts and whole numbers [R]. A text such as "007" stays a text. A negative number
+            becomes a text, because a label below 0 means that the id is unknown.
     """
     texts = [str(name) for name in ids]
     whole = [name.isascii() and name.isdigit() and len(name) < 20 for name in texts]

@@ -75,7 +75,7 @@ def _cut_bin(size: Any, low: int, high: int, state: Any, waiting: Any, pieces: A
 
 @njit(cache=True)
 def _stacking_order(pieces: Any, n: int, shape: tuple[int, int], state: Any, out: Any) -> None:
-    """Order the pieces by CUT-2: repeatedly draw one of those whose whole floor is built."""
+    """Order the pieces as CUT-2 does: repeatedly draw a piece whose whole floor is complete."""
     height = np.zeros(shape, np.int64)
     left = np.arange(n)
     ready = np.empty(n, np.int64)
@@ -113,23 +113,24 @@ def cut(
 ) -> Tensor:
     """Cut the bin into sequences of items whose perfect packing is known.
 
-    Start with the bin; while there are pieces with an edge longer than ``high``, choose one of them
-    and one of its possible cuts, across such an edge at a position in [low, edge - low], both
-    uniformly, and replace it by the two parts. With pieces in the order in which they are finished,
-    neighbours in a sequence are equal as often as in the published CUT-1.
+    Start with the whole bin. While a piece has an edge longer than ``high``, choose uniformly one
+    of these pieces and one of its possible cuts: across such an edge, at a position in
+    [low, edge - low]. Replace the piece by the two parts. Pieces are listed in the order in which
+    they are finished, so that neighbours in a sequence are equal as often as in the published
+    CUT-1.
 
     Args:
-        size: (W, D, H).
-        order: 1 sorts the pieces by the height of their bottom face; 2 repeatedly draws one whose
-            whole floor is built.
-        seed: of the sequences.
-        episodes: int64 [K], which ones.
+        size: (W, D, H) of the bin.
+        order: 1 sorts the pieces by the height of their bottom face; 2 repeatedly draws a piece
+            whose whole floor is complete.
+        seed: seed of the sequences.
+        episodes: int64 [K], numbers of the episodes.
         sides: (low, high), shortest and longest edge; ``high ≥ 2 · low - 1`` and the bin's sides
             at least ``low``.
 
     Returns:
         int16 [K, L, 6] on the CPU, rows x, y, z, w, d, h in the order of arrival, then zeros. The
-        boxes fill the bin exactly, and in this order each finds its floor complete.
+        boxes fill the bin exactly, and in this order each box has a complete floor.
 
     Raises:
         ValueError: if the bin cannot be cut into such pieces.

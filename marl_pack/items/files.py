@@ -1,7 +1,7 @@
 """Read item sequences from ``.npz``, ``.json`` and ``.csv`` files.
 
-The readers bring what a file contains into the arguments of
-:func:`marl_pack.items.checking.check_items`, which checks it.
+The readers turn the content of a file into arguments of
+:func:`marl_pack.items.checking.check_items`, which checks them.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ FIELDS = ("items", *KEYS, "lengths", "bin")
 
 
 def read_fields(path: Path) -> dict[str, Any]:
-    """Return the fields of a file by key, some of :data:`FIELDS`; its ending names the format.
+    """Return the fields of a file by key, some of :data:`FIELDS`; its ending says the format.
 
     Raises:
         ValueError: for another ending, an unreadable file, a missing or unknown column, key or
-            array, or a row that is not three numbers, which is named.
+            array, or a row that is not three numbers; the message names the row.
     """
     readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
     suffix = path.suffix.lower()
@@ -41,7 +41,7 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def check_fields(fields: Mapping[str, Any], source: str, what: str = "key") -> None:
-    """Refuse unknown keys and missing items; ``what`` is a key or an array.
+    """Refuse unknown keys and missing items; messages call a key ``what``.
 
     Raises:
         ValueError: naming the nearest valid key.
@@ -59,7 +59,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Return the keys of an object, or the items that a list gives."""
+    """Return the fields of an object in JSON, or the field ``items`` for a list."""
     content = read_json(path)
     fields = content if isinstance(content, dict) else {"items": content}
     check_fields(fields, str(path))
@@ -97,7 +97,7 @@ def _selected(values: list[Any] | NDArray[Any], order: NDArray[np.int64]) -> Any
 
 
 def _numbers(path: Path, cells: dict[str, list[str]], name: str) -> NDArray[np.float64]:
-    """Return a column of numbers; refuse the first row that has none there."""
+    """Return a column of numbers; refuse the first row in which it is not a number."""
     numbers: list[float] = []
     try:
         for text in cells[name]:
@@ -115,7 +115,7 @@ def _read_table(path: Path) -> dict[str, list[str]]:
 
     Raises:
         ValueError: for a column that is missing, unknown or given twice, or a row with too few
-            or too many values, which is named.
+            or too many values; the message names the column or the row.
     """
     lines = read_lines(path, trim=True)
     columns = [name.strip() for name in next(lines, (0, []))[1]]

@@ -14,7 +14,7 @@ DEFAULT_SIDES = (2, 5)
 
 
 def no_such_file(items: str | Path) -> FileNotFoundError:
-    """Return the error that items are neither generated nor in a file; it says what was meant."""
+    """Return the error for items that are neither a stream's name nor a file, with a guess."""
     guess = renamed.guess(str(items), GENERATED)
     return FileNotFoundError(
         f"{items}: no such file; items are {', '.join(GENERATED)} or a file{guess}"

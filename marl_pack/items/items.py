@@ -1,8 +1,8 @@
 """The items to be packed, and the table of their attributes.
 
-:class:`Items` is the record that streams, games and plans share. :data:`ATTRIBUTES` says how files,
-arrays and mappings give the attributes: the readers loop over it, so another attribute is one more
-row there and the code that uses it.
+Streams, games and plans use the record :class:`Items`. :data:`ATTRIBUTES` says how files, arrays
+and mappings give the attributes. The readers loop over this table, so a new attribute needs one
+more row there and the code that uses it.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ LONGEST_ID = 200
 
 @dataclass(frozen=True)
 class Items:
-    """Items with their attributes, one tensor an attribute.
+    """Items with their attributes, one tensor for each attribute.
 
     Leading dimensions are free, e.g. [G] for the visible item of G games or [S, L] for S sequences.
-    An attribute that is None has its default for every item, which costs nothing to carry.
+    An attribute that is None has its default value for every item and needs no memory.
     """
 
     sides: Tensor  # int16 [..., 3]              own sides w, d, h in cells; zeros: no item
-    weights: Tensor  # float64 [...]             weight; volumes unless given
+    weights: Tensor  # float64 [...]             weight; by default the volume
     orientations: Tensor | None = None  # bool [..., 6]  orientations it may be placed in; None: all
-    ids: Tensor | None = None  # int64 [...]     number of the item; None: its place in the sequence
+    ids: Tensor | None = None  # int64 [...]     number; None: position in the sequence
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Items:
         """Return the items with ``change`` applied to every field that is not None."""
@@ -57,11 +57,11 @@ class Items:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def numbered(self, t: Tensor) -> Items:
-        """Return the items with their places ``t`` as ids, unless they have ids."""
+        """Return the items; without ids, their positions ``t`` in the sequences become the ids."""
         return self if self.ids is not None else Items(**self.tensors() | {"ids": t})
 
     def ids_at(self, t: Tensor) -> Tensor:
-        """Return the items' ids, or their places ``t`` if they have none."""
+        """Return the items' ids; without ids, their positions ``t`` in the sequences."""
         return t if self.ids is None else self.ids
 
     @property
@@ -70,7 +70,7 @@ class Items:
         return self.sides[..., 0] > 0
 
     def orientation_sets(self) -> dict[tuple[int, ...], float]:
-        """Return the sets of orientations that items may take, with the share of items of each."""
+        """Return the sets of orientations that items may take → share of items with this set."""
         if self.orientations is None:
             return {ALL_ORIENTATIONS: 1.0}
         masks = self.orientations[self.present].cpu().numpy()
@@ -87,7 +87,7 @@ def join(parts: Sequence[Items]) -> Items:
 
 @dataclass(frozen=True)
 class Attribute:
-    """An attribute of goods, as files, arrays and mappings give it.
+    """How files, arrays and mappings give one attribute of items.
 
     Args:
         column: its column in a CSV file.
@@ -96,10 +96,11 @@ class Attribute:
         needs: what a value must be, for error messages.
         shape: shape of one item's value.
         dtype: NumPy type of the values.
-        kinds: kinds of NumPy arrays that are converted whole; other values are parsed one by one.
-        of_text: from the text of a CSV cell to a value as JSON has it; raises ValueError.
-        parse: from one value (of JSON, a mapping or an array) to the value; raises ValueError,
-            TypeError or KeyError.
+        kinds: kinds of NumPy arrays that are converted as a whole; other values are parsed one by
+            one.
+        of_text: function from the text of a CSV cell to a value as in JSON; raises ValueError.
+        parse: function from one value in JSON, a mapping or an array to the checked value; raises
+            ValueError, TypeError or KeyError.
         check: which of the values [R, *shape] are valid, bool [R].
     """
 
@@ -114,7 +115,7 @@ class Attribute:
     check: Callable[[NDArray[Any]], NDArray[np.bool_]]
 
     def of_cells(self, cells: Sequence[str]) -> list[Any]:
-        """Return the values of CSV cells as JSON has them; texts that are none stay texts."""
+        """Return the values of CSV cells as in JSON; a text that is not a value stays a text."""
         values: list[Any] = []
         for cell in cells:
             try:
@@ -208,7 +209,7 @@ def _id(value: Any) -> str | int:
 
 
 def _short(ids: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which texts among ids have an allowed length, bool [R]."""
+    """Return which ids are whole numbers or allowed texts, bool [R]."""
     return np.array([not isinstance(i, str) or _is_text(i) for i in ids], bool)
 
 
@@ -235,7 +236,7 @@ ATTRIBUTES = (
         lambda values: np.array(values >= 1, bool),
     ),
 )  # fmt: skip
-"""The attributes that items may be given with."""
+"""The attributes that users may give with items."""
 
 KEYS = tuple(attribute.key for attribute in ATTRIBUTES)
 """Keys of the attributes in files and mappings."""

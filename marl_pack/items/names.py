@@ -26,7 +26,7 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     "this_side_up": ("upright",),
     "width": ("w", "d"),
 }
-"""Names that are used for the same things elsewhere, and the valid names they stand for."""
+"""Names that other programs use → the valid names that they may stand for."""
 
 
 def check_names(
@@ -42,7 +42,7 @@ def check_names(
         what: what they name: a column, key, array or attribute.
 
     Raises:
-        ValueError: naming what is missing or unknown, the nearest valid name and all of them.
+        ValueError: naming what is missing or unknown, the nearest valid name and all valid names.
     """
     used = list(names)
     missing = [name for name in required if name not in used]

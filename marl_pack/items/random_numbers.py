@@ -1,4 +1,4 @@
-"""Counter-based random numbers, equal on every device, in every batch and by both backends."""
+"""Counter-based random numbers, equal on every device, in every batch and with both backends."""
 
 from __future__ import annotations
 

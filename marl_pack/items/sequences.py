@@ -1,4 +1,4 @@
-"""The stream of sequences of items that the user gives."""
+"""The stream of item sequences that the user gives."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Sequences:
         )
 
     def steps(self) -> Tensor:
-        """Return the place of each row in its sequence, int64 [R]."""
+        """Return the position of each row in its sequence, int64 [R]."""
         first, end = self.spans.unbind(1)
         rows = torch.arange(len(self.rows.sides), device=first.device)
         return rows - first.repeat_interleave(end - first)
@@ -49,7 +49,7 @@ class Sequences:
 
     @property
     def orientation_sets(self) -> dict[tuple[int, ...], float]:
-        """Sets of orientations that items may take, with the share of items that have each."""
+        """Sets of orientations that items may take → share of items with this set."""
         return self.rows.orientation_sets()
 
     @property
@@ -67,7 +67,7 @@ class Sequences:
         return episodes % self.episodes
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
-        """Return the state in which the games ``ended`` begin the sequences ``episodes``."""
+        """Return the state in which the games ``ended`` have begun the episodes ``episodes``."""
         return torch.where(ended, self.start(seed, episodes), state)
 
     def item(self, state: Tensor, t: Tensor) -> Items:
@@ -82,5 +82,5 @@ class Sequences:
         ).numbered(t)
 
     def to(self, device: torch.device | str, backend: Backend | None = None) -> Sequences:
-        """Return the same sequences on ``device``; every backend looks items up alike."""
+        """Return the same sequences on ``device``; both backends use the same code."""
         return replace(self, rows=self.rows.to(device), spans=self.spans.to(device))

@@ -1,4 +1,4 @@
-"""Make the stream that a name, a file, an array, a mapping or a record stands for."""
+"""Make a stream from a name, a file, an array, a mapping or a record."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from marl_pack.items.streams import Cut, Stream, Uniform
 MEMBERS = tuple(name for name in vars(Stream) if not name.startswith("_"))
 """Names of the members of a stream."""
 METHODS = tuple(name for name in MEMBERS if callable(getattr(Stream, name)))
-"""Those that are methods."""
+"""Names of the members that are methods."""
 
 
 def load(
     path: str | Path, size: Size | None = None, otherwise: Size | None = None
 ) -> tuple[Sequences, Size]:
-    """Read item sequences from a file, by its ending.
+    """Read item sequences from a file; its ending says the format.
 
-    - ``.npz``: ``items`` [S, L, 3] or [L, 3]; if wanted, attributes by key
+    - ``.npz``: ``items`` [S, L, 3] or [L, 3]; optionally attributes by key
       (:data:`marl_pack.items.ATTRIBUTES`), ``lengths`` [S] and ``bin`` [3].
-    - ``.json``: an object with the same keys, ``items`` also as sequences of unequal length; or
-      just the items.
-    - ``.csv``: a header naming the columns w, d, h and, if wanted, attributes and sequence (a
-      number or text; rows of one sequence keep their order); one item a row.
+    - ``.json``: an object with the same keys, where ``items`` may also be sequences of unequal
+      length; or only the items.
+    - ``.csv``: a header with the columns w, d, h and optionally attributes and sequence (a number
+      or text; rows of one sequence keep their order); then one item a row.
 
     Args:
         path: the file.
-        size: (W, D, H); by default the file's own ``bin``.
-        otherwise: the bin size if neither says one.
+        size: (W, D, H) of the bin; by default ``bin`` in the file.
+        otherwise: the bin size if neither ``size`` nor the file gives one.
 
     Returns:
         The sequences and the bin size.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: for another ending, a missing or unknown key or column, no bin size or another
-            one than the file's, or an item that is impossible, with its row.
+        ValueError: for another ending, a missing or unknown key or column, a missing bin size, a
+            ``size`` that differs from the file's, or an impossible item; the message names its row.
     """
     path = Path(path)
     if not path.is_file():
@@ -59,17 +59,17 @@ def load(
 def _from_fields(
     fields: Mapping[str, Any], size: Size | None, source: str, otherwise: Size | None = None
 ) -> tuple[Sequences, Size]:
-    """Return the sequences that the fields of a file or a mapping give, and the bin size."""
-    own = fields.get("bin")
+    """Return the sequences and the bin size from the fields of a file or a mapping."""
+    given_size = fields.get("bin")
     try:
-        own = None if own is None else check_size(own)
+        given_size = None if given_size is None else check_size(given_size)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    bin_size = own or otherwise if size is None else check_size(size)
+    bin_size = given_size or otherwise if size is None else check_size(size)
     if bin_size is None:
-        raise ValueError(f"{source}: has no bin size of its own; give one, W D H")
-    if own not in (None, bin_size):
-        raise ValueError(f"{source}: is for the bin {own}, not {bin_size}; give that size")
+        raise ValueError(f"{source}: has no bin size; give one, W D H")
+    if given_size not in (None, bin_size):
+        raise ValueError(f"{source}: is for the bin {given_size}, not {bin_size}; give that size")
     attributes = {key: values for key, values in fields.items() if key not in ("items", "bin")}
     return check_items(fields["items"], bin_size, source=source, **attributes), bin_size
 
@@ -79,7 +79,7 @@ def make_stream(
     size: Size,
     sides: tuple[int, int] = DEFAULT_SIDES,
 ) -> Stream:
-    """Return the stream that ``items`` stands for.
+    """Return a stream of the items that ``items`` describes.
 
     Args:
         items: ``"rs"``, ``"cut1"``, ``"cut2"``; a file (:func:`load`); an array [L, 3] or
@@ -89,8 +89,8 @@ def make_stream(
         sides: shortest and longest side of generated items.
 
     Raises:
-        ValueError: if an item fits into the bin in none of its orientations, the name is unknown,
-            or an object lacks a member of a stream or has an impossible one.
+        ValueError: if an item does not fit into the bin in any of its orientations, the name is
+            unknown, or a member of a stream is missing or impossible.
     """
     size = check_size(size)
     if isinstance(items, str) and items in GENERATED:
@@ -111,7 +111,7 @@ def make_stream(
 
 
 def check_stream(stream: Any) -> Stream:
-    """Return an object that has the members of a stream, with values that a game can use.
+    """Check that an object has the members of a stream with possible values, and return it.
 
     Raises:
         ValueError: naming the members that are missing, or the first with an impossible value.
@@ -143,7 +143,7 @@ def check_stream(stream: Any) -> Stream:
 
 
 def _generated(name: str, size: Size, sides: tuple[int, int]) -> Stream:
-    """Return a stream of :data:`GENERATED`; refuse one that has no items for this bin."""
+    """Return a stream of :data:`GENERATED`; refuse it if its items cannot fit this bin."""
     low, high = check_sides(sides)
     if name == "rs":
         if high > min(size):
@@ -163,13 +163,14 @@ def choose_stream(
     sides: tuple[int, int] = DEFAULT_SIDES,
     otherwise: Size | None = None,
 ) -> tuple[Stream, Size]:
-    """Return the stream and the bin size that a command's options name.
+    """Return the stream and the bin size that a command's options describe.
 
     Args:
         items: a name in :data:`GENERATED` or a file.
-        size: (W, D, H); by default that of the file.
+        size: (W, D, H) of the bin; by default the size in the file.
         sides: shortest and longest side of generated items.
-        otherwise: the bin size if neither says one; for generated items 10 × 10 × 10.
+        otherwise: the bin size if neither ``size`` nor a file gives one; by default 10 × 10 × 10
+            for generated items.
     """
     if items in GENERATED:
         size = check_size(size or otherwise or (10, 10, 10))

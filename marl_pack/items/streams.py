@@ -1,12 +1,13 @@
 """Item streams: the items that the conveyor brings, episode by episode.
 
-A stream is three pure functions. ``start(seed, episodes)`` returns the state of each episode,
-``item(state, t)`` the item at step t of each, and ``restart`` the state after some have ended.
-Episode k of seed s is the same sequence in every batch and on every device. Weights are volumes
-unless they are given.
+A stream has three pure functions. ``start(seed, episodes)`` returns the state of each episode,
+``item(state, t)`` returns the item at step t of each episode, and ``restart`` returns the state
+after some episodes have ended. Episode k of seed s is the same sequence in every batch and on every
+device. By default, the weight of an item is its volume.
 
-Sources (Zhao et al. 2021, sec. 5): ``rs`` draws uniformly from all types; ``cut1`` and ``cut2`` cut
-the bin itself into items, so that a perfect packing is known (:mod:`marl_pack.items.cutting`).
+The generated streams are those of Zhao et al. 2021, sec. 5: ``rs`` draws uniformly from all types;
+``cut1`` and ``cut2`` cut the bin itself into items, so that a perfect packing is known
+(:mod:`marl_pack.items.cutting`).
 """
 
 from __future__ import annotations
@@ -54,12 +55,12 @@ class Stream(Protocol):
 
     @property
     def episodes(self) -> int | None:
-        """Number of different episodes; None if there is no end of them."""
+        """Number of different episodes; None if it is not limited."""
         ...
 
     @property
     def longest(self) -> int | None:
-        """The most items an episode has; None if there is no end of them."""
+        """The largest number of items in an episode; None if it is not limited."""
         ...
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
@@ -70,17 +71,18 @@ class Stream(Protocol):
         """Return the state [N, …] in which some episodes begin and the others continue.
 
         Args:
-            state: of the N episodes; it is not changed.
-            seed: of the episodes that begin.
-            episodes: int64 [N], the numbers of those that begin; elsewhere they have no effect.
-            ended: bool [N], where they begin.
+            state: state of the N episodes; it is not changed.
+            seed: seed of the episodes that begin.
+            episodes: int64 [N], numbers of the episodes that begin; the other numbers have no
+                effect.
+            ended: bool [N], where an episode has ended and the next one begins.
         """
         ...
 
     def item(self, state: Tensor, t: Tensor) -> Items:
         """Return the items [N] at step ``t`` (int64 [N]); zeros past the end.
 
-        Their ids are those given with the items, else ``t`` itself.
+        Their ids are those that the user gave; without ids, they are ``t``.
         """
         ...
 
@@ -88,7 +90,7 @@ class Stream(Protocol):
         """Return the same stream with its tables on ``device``.
 
         Args:
-            device: where states and items are.
+            device: the device of states and items.
             backend: the code that draws items; by default the faster one on ``device``.
         """
         ...
@@ -98,7 +100,7 @@ class Stream(Protocol):
 
 
 def _uniform_compiled(keys: Tensor, t: Tensor, low: int, kinds: int) -> tuple[Tensor, Tensor]:
-    """Draw items by one compiled loop, which beats thirty tensor operations on the CPU."""
+    """Draw items by one compiled loop, on the CPU faster than thirty tensor operations."""
     sides, weights = np.empty((len(keys), 3), np.int16), np.empty(len(keys))
     _uniform_loop(keys.numpy(), t.numpy(), low, kinds, sides, weights)
     return torch.from_numpy(sides), torch.from_numpy(weights)
@@ -158,7 +160,7 @@ class Uniform:
         return torch.where(ended, self.start(seed, episodes), state)
 
     def item(self, state: Tensor, t: Tensor) -> Items:
-        """Return the items [N] at step ``t``, drawn by counting from the episode's key."""
+        """Return the items [N] at step ``t``, drawn from the episode's key and ``t``."""
         draw_items = self.backend.pick(compiled=_uniform_compiled, tensor=_uniform_tensor)
         sides, weights = draw_items(state, t, self.low, self.high - self.low + 1)
         return Items(sides, weights, ids=t)
@@ -199,7 +201,7 @@ class Cut:
 
     @property
     def longest(self) -> int:
-        """Number of pieces if all are the smallest."""
+        """Number of pieces if all have the smallest size."""
         return int(np.prod([s // self.low for s in self.size]))
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
@@ -210,10 +212,9 @@ class Cut:
         return items.to(episodes.device)
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
-        """Return the episodes' items, cut again where they have ended.
+        """Return the episodes' items, newly cut where an episode has ended.
 
-        Cutting is CPU code, so only the episodes that ended are cut, and the host waits for their
-        number.
+        Cutting is CPU code, so only these episodes are cut, and the host waits for their number.
         """
         index = ended.nonzero().squeeze(1)
         return state.index_copy(0, index, self.start(seed, episodes[index]))
@@ -266,7 +267,7 @@ class Drawn:
         return torch.where(ended, self.start(seed, episodes), state)
 
     def item(self, state: Tensor, t: Tensor) -> Items:
-        """Return the items [N] at step ``t``, rows of the table drawn by counting."""
+        """Return the items [N] at step ``t``, drawn from the table by key and ``t``."""
         return self.items[below(mix(state, t), len(self.items.sides))].numbered(t)
 
     def to(self, device: torch.device | str, backend: Backend | None = None) -> Drawn:
@@ -275,15 +276,16 @@ class Drawn:
 
 
 AT_ONCE = 1 << 20
-"""About how many numbers of states are copied at once when a stream's items are collected."""
+"""Approximate number of state entries copied at once when a stream's items are collected."""
 
 
 def independent(stream: Stream, sequences: int = 500) -> Stream:
-    """Return a stream of items that are i.i.d., each as probable as in ``stream``.
+    """Return a stream of i.i.d. items, each as probable as in ``stream``.
 
     Args:
-        stream: RS or a table, which are i.i.d. themselves; else its sequences' items are drawn.
-        sequences: number of sequences to draw from, where the stream has no end of them.
+        stream: a stream. RS and tables are i.i.d. and are returned unchanged; for other streams,
+            items are drawn from their sequences.
+        sequences: number of sequences to draw from if the stream has no limit on episodes.
 
     Raises:
         ValueError: if the stream's sequences have no end.
@@ -296,12 +298,12 @@ def independent(stream: Stream, sequences: int = 500) -> Stream:
     if stream.longest is None:
         raise ValueError(f"{type(stream).__name__}: needs sequences that end, or a stream of RS")
     count = stream.episodes or sequences
-    state = stream.start(-1, torch.arange(count))  # episodes that are played have seeds from 0
+    state = stream.start(-1, torch.arange(count))  # played episodes have seeds ≥ 0
     parts = []
     for steps in torch.split(torch.arange(stream.longest), max(1, AT_ONCE // state.numel())):
         t = steps.repeat_interleave(count)
         items = stream.item(state[torch.arange(count).repeat(len(steps))], t)
-        if items.ids is t:  # places in a sequence mean nothing outside it
+        if items.ids is t:  # a position means nothing outside its sequence
             items = replace(items, ids=None)
         parts.append(items[items.present])
     return Drawn(join(parts), id_names=stream.id_names)

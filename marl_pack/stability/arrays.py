@@ -1,4 +1,4 @@
-"""Compute the mask of a stability rule for NumPy arrays, without an environment."""
+"""Compute the mask of a stability rule from NumPy arrays, without an environment."""
 
 from __future__ import annotations
 
@@ -32,21 +32,23 @@ def stable_mask(
     com_offset: tuple[float, float, float] = NO_OFFSET,
     **parameters: object,
 ) -> NDArray[np.bool_]:
-    """Return where one box may be placed in one bin, for NumPy arrays without an environment.
+    """Return where one box may be placed in one bin, from NumPy arrays without an environment.
 
     Args:
         rule: a name in :data:`RULES`, or a rule from :func:`make_rule`.
         heightmap: whole numbers [W, D], top of each column in cells.
         empty_map: whole numbers [W, D], empty cells below the top of each column (Algorithm 2); 0
-            where the column is filled down to the floor. A heightmap alone does not show them.
+            where the column is filled down to the floor. The heightmap does not show these cells.
         item: w, d, h along x, y, z, in cells.
         bin_height: H in cells.
         boxes: rows x, y, z, w, d, h of the boxes in the bin; ``lbcp`` and ``equilibrium`` need
             them unless the bin is empty.
-        weights: the boxes' weights [n] (``equilibrium``), central; their volumes by default.
-        weight: the item's weight; its volume by default.
-        com_offset: the item's centre of mass from its geometric centre, in fractions of w, d, h.
-        **parameters: of the rule, e.g. ``margin=1.0`` or ``thresholds="code"``.
+        weights: the boxes' weights [n], for ``equilibrium``; by default their volumes. Each centre
+            of mass is in the middle of the box.
+        weight: the item's weight; by default its volume.
+        com_offset: offset of the item's centre of mass from its geometric centre, in fractions of
+            w, d, h.
+        **parameters: parameters of the rule, e.g. ``margin=1.0`` or ``thresholds="code"``.
 
     Returns:
         Bool [W, D]: true at each low corner (x, y) where the box fits and is stable.
@@ -58,9 +60,9 @@ def stable_mask(
     sides = _check_item(item)
     bound = _bind(rule, parameters, with_boxes=boxes is not None or not heights.any())
     stack, load = _stack(boxes, weights, heights, empty)
-    own_weight = None
+    item_weight = None
     if weight is not None:
-        own_weight = torch.tensor([_check_weight(weight)], dtype=torch.float64)
+        item_weight = torch.tensor([_check_weight(weight)], dtype=torch.float64)
     offset = check_com_offset(com_offset)
     if (sides > (*heights.shape, bin_height)).any():
         return np.zeros(heights.shape, np.bool_)
@@ -78,7 +80,7 @@ def stable_mask(
     oriented = OrientedItem(
         torch.from_numpy(sides.astype(np.int16))[None, None],
         (offset[:2],) if any(offset[:2]) else None,
-        own_weight,
+        item_weight,
     )
     return bound(bins, oriented)[0, 0].numpy()
 
@@ -141,8 +143,8 @@ def _bind(
 
     Args:
         rule: a name or a bound rule.
-        parameters: to bind to a named rule.
-        with_boxes: whether the boxes of the stack were given, or there are none.
+        parameters: parameters to bind; only for a name.
+        with_boxes: whether the stack is known: its boxes are given, or the bin is empty.
 
     Raises:
         ValueError: for parameters of a bound rule, or if the rule needs boxes that were not given.
@@ -160,8 +162,8 @@ def _bind(
     if not with_boxes and function in (lbcp, equilibrium):
         raise ValueError("boxes: the rule needs the whole stack; give boxes, rows x y z w d h")
     if function is equilibrium:
-        own: dict[str, object] = getattr(bound, "keywords", {})
-        bound = make_rule("equilibrium", **({"check_stack": True} | own))
+        keywords: dict[str, object] = getattr(bound, "keywords", {})
+        bound = make_rule("equilibrium", **({"check_stack": True} | keywords))
     return bound
 
 
@@ -174,7 +176,7 @@ def _stack(
     """Return the boxes, sorted so that they can be placed one by one, and their loads.
 
     Raises:
-        ValueError: if a box cannot be placed, or the boxes do not make the maps.
+        ValueError: if a box cannot be placed, or the boxes do not lead to the maps.
     """
     if boxes is None:
         if weights is not None:
@@ -193,11 +195,11 @@ def _stack(
         if resting_height != z:
             raise ValueError(f"{name} rests at {resting_height}: it floats or overlaps another")
     if (heightmap != heights).any() or (empty_map != empty).any():
-        raise ValueError("boxes: need to make this heightmap and empty_map")
+        raise ValueError("boxes: do not lead to this heightmap and empty_map")
     load = uniform_loads(stack)
     if weights is not None:
         own_weights = np.asarray(weights)
         if own_weights.shape != (len(stack),) or np.ma.is_masked(weights):
-            raise ValueError(f"weights: needs one number a box, {len(stack)}")
+            raise ValueError(f"weights: needs one number for each of {len(stack)} boxes")
         load[:, 0] = [_check_weight(own_weights[row]) for row in order]
     return stack, load

@@ -1,7 +1,8 @@
 """Centres of mass and margins as exact numbers, in tables that fast code can use.
 
-A decimal that a user writes means that decimal: 0.1 is one tenth, though no float64 is. A centre of
-mass may lie exactly on the edge of its support, where the least rounding error would decide.
+A decimal from a user means exactly this decimal: 0.1 is one tenth, although no float64 is exactly
+one tenth. A centre of mass may lie exactly on the edge of its support, where the smallest rounding
+error would change the result.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ fractions of the item's sides as oriented."""
 HALF = Fraction(1, 2)
 
 LARGEST_WHOLE = 2.0**53
-"""Whole numbers up to this one are exact in float64."""
+"""Whole numbers up to this limit are exact in float64."""
 
 
 def exact(value: float | Fraction) -> Fraction:
@@ -35,7 +36,7 @@ def exact(value: float | Fraction) -> Fraction:
     return value if isinstance(value, Fraction) else _decimal(float(value))
 
 
-@lru_cache(maxsize=1 << 14)  # the same weights and centres come again and again
+@lru_cache(maxsize=1 << 14)  # the same weights and centres occur often
 def _decimal(value: float) -> Fraction:
     """Return the fraction that the shortest decimal of a float stands for."""
     return Fraction(str(value))
@@ -43,15 +44,15 @@ def _decimal(value: float) -> Fraction:
 
 @dataclass(frozen=True)
 class CentreTable:
-    """Where centres of mass lie, for A orientations, both axes and every side from 0 to L.
+    """Positions of centres of mass, for A orientations, both axes and every side from 0 to L.
 
     Coordinates count from the window's low corner in units of 1 / ``unit`` cells.
     """
 
     at: NDArray[np.float64]  # [A, 2, L + 1]  the centre of mass
-    # int64 [A, 2, L + 1]: cells that begin below the centre of mass by more than the margin
+    # int64 [A, 2, L + 1]: number of cells that begin more than the margin below the centre of mass
     low: NDArray[np.int64]
-    # int64 [A, 2, L + 1]: first cell that ends above the centre of mass by more than the margin
+    # int64 [A, 2, L + 1]: first cell that ends more than the margin above the centre of mass
     start: NDArray[np.int64]
     unit: float  # units in a cell
     margin: float  # in units
@@ -75,18 +76,18 @@ class CentreTable:
 
 @lru_cache(maxsize=64)
 def centre_table(offsets: Offsets, margin: float, longest: int) -> CentreTable:
-    """Compute the table of centres of mass, all of it in exact arithmetic.
+    """Compute the table of centres of mass in exact arithmetic.
 
     Args:
-        offsets: for each orientation; decimals mean what they say.
-        margin: cells by which the support polygon is shrunk; a decimal means what it says.
+        offsets: offsets for each orientation; decimals are taken exactly.
+        margin: cells by which the support polygon is shrunk; a decimal is taken exactly.
         longest: L, the longest side that a window may have.
     """
     shares = [[HALF + exact(offset) for offset in pair] for pair in offsets]
     exact_margin = exact(margin)
     denominators = [share.denominator for pair in shares for share in pair]
     unit = math.lcm(*denominators, exact_margin.denominator)
-    # The tests multiply coordinates with differences of cells, and add two such products.
+    # The stability tests multiply coordinates by differences of cells and add two such products.
     whole = 4 * unit * (longest + 1) ** 2 <= LARGEST_WHOLE
     unit = unit if whole else 1
     shape = (len(offsets), 2, longest + 1)

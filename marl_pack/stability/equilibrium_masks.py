@@ -1,9 +1,9 @@
-"""Masks of exact static equilibrium: the cells where a box leaves the whole stack standing.
+"""Masks of exact static equilibrium: the cells where the whole stack still stands with a new box.
 
 Where ``hull_alpha`` is true, the stack stands: the new weight goes straight down through filled
-columns. Where ``hull_1`` is false, it does not: the box itself tips. Only the other cells are
-solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`, and near a
-tie by the same program in whole numbers.
+columns. Where ``hull_1`` is false, it does not stand: the new box itself tips. Only the other cells
+are solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Near a
+tie, the same program is solved in whole numbers.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from marl_pack.stability.reduced_equilibrium import (
 from marl_pack.stability.static_equilibrium import in_equilibrium
 
 CORNERS = ((1020, 0), (942, 391), (721, 721), (391, 942))
-"""Corners, in thousandths of the margin, of a polygon around the disc of that radius: these, and
-the same rotated by quarters. It is 2 % on the safe side."""
+"""Corners of a polygon around the disc whose radius is the margin, in thousandths of the margin.
+The other corners are these corners rotated by 90°, 180° and 270°. The polygon reaches at most 2 %
+beyond the disc, which is the safe side."""
 
 
 @njit(cache=True, nogil=True)
@@ -43,8 +44,9 @@ def _solve_band(
 ) -> None:  # fmt: skip
     """Write YES, NO or UNSURE to ``verdict`` [N, A, W, D] for every cell of ``band``.
 
-    YES: the stack stands with every one of the ``shifts`` [S, 2] of the new box's centre of mass.
-    ``whole`` [N]: whether all of the stack is solved, not only the boxes that may be disturbed.
+    YES means that the stack stands for each of the ``shifts`` [S, 2] of the new box's centre of
+    mass. ``whole`` [N] says whether the whole stack is solved, or only the boxes that the new box
+    may disturb.
     """
     n, width, depth = heightmap.shape
     scratch = np.empty((3, 2 * width + 2, 2), np.int64)
@@ -89,18 +91,19 @@ def equilibrium_mask(
     margin: float = 0.0,
     check_stack: bool = False,
 ) -> Tensor:
-    """Compute where a box leaves the whole stack in strict equilibrium, bool [N, A, W, D].
+    """Compute where the whole stack with a new box is in strict equilibrium, bool [N, A, W, D].
 
     The linear programs are solved on the CPU, whatever device the bins are on.
 
     Args:
-        bins: with their boxes in order of placement.
-        item: as for every rule.
+        bins: N bins, with their boxes in order of placement.
+        item: the new boxes, items in A orientations.
         surely: bool [N, A, W, D], the mask of ``hull_alpha``: cells known to be stable.
         possibly: bool [N, A, W, D], the mask of ``hull_1``: cells that may be stable.
-        margin: the new box's centre of mass may lie anywhere within so many cells of its place.
+        margin: the stack must stand with the new box's centre of mass anywhere within so many cells
+            of its position.
         check_stack: whether to check first that the stack is in equilibrium. Where it is not,
-            nothing is assumed and the whole stack is solved for every cell of ``possibly``.
+            the whole stack is solved for every cell of ``possibly``.
 
     Returns:
         ``surely``, and the cells of ``possibly`` where the whole stack stands.
@@ -132,7 +135,7 @@ def equilibrium_mask(
 
 
 def shifts_of(margin: float) -> list[tuple[Fraction, Fraction]]:
-    """Return the shifts of a centre of mass that it must bear, exact numbers of cells."""
+    """Return the shifts (x, y) of a centre of mass with which the stack must stand, in cells."""
     if margin == 0:
         return [(Fraction(0), Fraction(0))]
     scale = exact(margin) / 1000
@@ -150,7 +153,7 @@ def _stands_exactly(
     shifts: list[tuple[Fraction, Fraction]],
     whole: bool,
 ) -> bool:
-    """Decide one cell (b, a, x, y) in exact arithmetic."""
+    """Decide in exact arithmetic whether the stack stands with a box at the cell (b, a, x, y)."""
     b, a, x, y = cell
     k = int(stack.count[b])
     w, d, h = item.sides[b, a].tolist()

@@ -1,16 +1,18 @@
-r"""Strict static equilibrium decided exactly, where float64 leaves it open.
+r"""Decide strict static equilibrium exactly, where float64 is not accurate enough.
 
-The linear program is that of :mod:`marl_pack.stability.static_equilibrium`: forces
+The linear program is the one in :mod:`marl_pack.stability.static_equilibrium`: forces
 :math:`f \ge 0` at the corners of the contacts balance every box, :math:`A f = w`, and the stack
 stands strictly if :math:`A f = w, f \ge t` has a solution with :math:`t > 0`. All numbers are
-fractions, so each equation is multiplied until it is whole.
+fractions, so each equation can be multiplied until all its numbers are whole.
 
 - Far from a tie, the simplex method in float64 decides.
 - At a tie, its dual solution is a motion of the boxes that no contact resists and no weight
-  opposes: :math:`y \ne 0, y^T A \ge 0, y^T w \le 0`. Rounded to fractions with small denominators,
-  it is checked in whole numbers, and proves that the stack does not stand strictly (Farkas).
-- What is still open goes to a simplex method in whole numbers by integer pivoting: the tableau is
-  stored times the last pivot, and every division leaves no remainder (Edmonds 1967; Bareiss 1968).
+  opposes: :math:`y \ne 0, y^T A \ge 0, y^T w \le 0`. This motion is rounded to fractions with small
+  denominators and checked in whole numbers. If it passes, it proves that the stack does not stand
+  strictly (Farkas' lemma).
+- The other stacks are solved by a simplex method in whole numbers with integer pivoting: the
+  stored tableau is multiplied by the last pivot, and no division leaves a remainder (Edmonds 1967;
+  Bareiss 1968).
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from numpy.typing import NDArray
 from marl_pack.stability.simplex import NEAR, max_least_force, nearly_a_tie
 
 Whole = NDArray[np.object_]
-"""Array of Python's whole numbers, which have no largest value."""
+"""Array of Python integers, which have no largest value."""
 DENOMINATORS = 10**6
 """Largest denominator of the fractions to which a dual solution is rounded."""
 GROUND = -1
-"""Index of what never moves: the floor, and boxes that are known to stand."""
+"""Index of everything that never moves: the floor, and boxes that are known to stand."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,8 @@ def stands_exactly(loads: Sequence[Load], forces: Iterable[Force]) -> bool:
     """Return whether boxes are in strict static equilibrium, by exact arithmetic.
 
     Args:
-        loads: of the boxes.
-        forces: that may act between them and the ground.
+        loads: the load of each box.
+        forces: the forces that may act between the boxes, and between boxes and ground.
     """
     columns = list(forces)
     if not columns:
@@ -68,13 +70,13 @@ def stands_exactly(loads: Sequence[Load], forces: Iterable[Force]) -> bool:
         rounded = a.astype(np.float64)
         total = float(weights.sum())
         relative = weights.astype(np.float64) * (len(loads) / total)
-    except OverflowError:  # decimals of hundreds of places
+    except OverflowError:  # numbers with hundreds of digits
         return _strictly_feasible(a, weights)
     largest = np.abs(rounded).max(1, initial=1.0)
     rounded /= largest[:, None]
     force, reliable, basis = max_least_force(rounded, relative, 10 * NEAR)
-    places = [place for column in columns for place in (column.x, column.y)]
-    if reliable and not nearly_a_tie(force, max(places) - min(places)):
+    positions = [position for column in columns for position in (column.x, column.y)]
+    if reliable and not nearly_a_tie(force, max(positions) - min(positions)):
         return bool(force > 0)
     motion = _motion(rounded, basis) / largest
     return not _moves_freely(a, weights, motion) and _strictly_feasible(a, weights)
@@ -85,7 +87,7 @@ def _motion(a: NDArray[np.float64], basis: NDArray[np.int64]) -> NDArray[np.floa
 
     Args:
         a: the equations [R, F].
-        basis: as :func:`marl_pack.stability.simplex.max_least_force` returns it.
+        basis: the basis that :func:`marl_pack.stability.simplex.max_least_force` returns.
     """
     columns = np.hstack((a, a.sum(1, keepdims=True), np.eye(len(a))))[:, basis]
     try:
@@ -100,7 +102,7 @@ def _moves_freely(a: Whole, weights: Whole, motion: NDArray[np.float64]) -> bool
     Args:
         a: the equations [R, F] in whole numbers.
         weights: their right-hand side [R].
-        motion: float64 [R], any numbers.
+        motion: float64 [R]; any numbers are allowed.
     """
     largest = np.abs(motion).max(initial=0.0)
     if not 0 < largest < np.inf:
@@ -114,7 +116,7 @@ def _moves_freely(a: Whole, weights: Whole, motion: NDArray[np.float64]) -> bool
 
 
 def _equations(loads: Sequence[Load], forces: Sequence[Force]) -> tuple[Whole, Whole]:
-    """Return the equations of the balance of force and moments, whole numbers [R, F] and [R]."""
+    """Return the equations that balance forces and moments, whole numbers [R, F] and [R]."""
     a = np.zeros((3 * len(loads), len(forces)), object)
     for column, force in enumerate(forces):
         for box, sign in ((force.upper, 1), (force.lower, -1)):
@@ -172,8 +174,9 @@ def _pivot(table: Whole, basis: NDArray[np.int64], scale: int, row: int, column:
 def _optimise(table: Whole, basis: NDArray[np.int64], scale: int, t: int) -> int:
     """Minimise the last row's objective by the simplex method; return the table's scale.
 
-    Largest coefficient first; Bland's rule once that might cycle, so that it ends. The search for a
-    positive t stops at the first one.
+    The column with the largest coefficient enters the basis. After many iterations, which may be a
+    cycle, Bland's rule is used, so that the method ends. The search for a positive t stops at the
+    first positive value.
 
     Args:
         table: whole numbers [R + 1, F + 2], times ``scale``.

@@ -1,20 +1,20 @@
 """Convex-hull masks in compiled loops: no window is read twice (Numba).
 
-Each column has K = 2 · height + 1 if it bears, else 2 · height. The largest K of a window gives its
-resting height, and whether a bearing cell lies at that height, in one small integer. If it is odd,
-the contact cells that count are those with K equal to it. One sliding maximum of K over quarter
-windows, by doubling on the flattened map, gives both for each quadrant of every window around the
-centre of mass:
+Each column has a number K: 2 · height + 1 if its top counts as support, else 2 · height. The
+largest K of a window says its resting height, and whether a supporting cell lies at this height, in
+one small integer. If it is odd, the contact cells that count are those with this K. One sliding
+maximum of K over quarter windows, by doubling on the flattened map, gives both for each quadrant of
+every window around the centre of mass:
 
 - a contact cell in all four quadrants: the centre of mass is strictly inside their hull;
 - no contact cell in two adjacent quadrants: all contact lies beyond a line through the centre of
   mass, so it is not inside;
-- only the other windows get the exact test on the extremes of the window's rows
+- only the other windows need the exact test on the first and last cells of the window's rows
   (:mod:`marl_pack.stability.hull_exact`).
 
 Small maps are processed in runs of windows of the same footprint, so that the loops are long
-enough for the CPU's vector units; entries that wrap around a row's end are invalid positions and
-are cleared. :mod:`marl_pack.stability.hull_tensor` is the same rule in batched tensor code.
+enough for the CPU's vector units. Entries that wrap around a row's end are invalid positions and
+are cleared. :mod:`marl_pack.stability.hull_tensor` has the same rule in batched tensor code.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ RUN_CELLS = 1024
 
 @njit(cache=True)
 def _decide(a: Any, b: Any, c: Any, d: Any, top: Any, code: Any) -> None:
-    """Decide windows from the largest K of their quadrants: ``a b`` low in x, ``a c`` low in y.
+    """Decide windows from the largest K of each of their four quadrants.
 
-    The best contact is in every quadrant if the least of the four equals their maximum, and in
-    every half if the least of the four halves' maxima does.
+    The highest contact lies in every quadrant if the smallest of the four numbers equals the
+    largest. It lies in every half if the smallest of the four halves' maxima equals the largest.
 
     Args:
-        a: integers [P], largest K of the quadrant low in x and y.
-        b: as ``a``, low in x and high in y.
-        c: as ``a``, high in x and low in y.
-        d: as ``a``, high in x and y.
-        top: integers [P], the largest K at which the box fits; overwritten with the window's own.
-        code: uint8 [P], YES | UNDECIDED at the positions that are valid, else 0; overwritten with
-            the verdict.
+        a: integers [P], largest K of the quadrant that is low in x and low in y.
+        b: integers [P], largest K of the quadrant that is low in x and high in y.
+        c: integers [P], largest K of the quadrant that is high in x and low in y.
+        d: integers [P], largest K of the quadrant that is high in x and high in y.
+        top: integers [P], the largest K at which the box fits; overwritten with the window's
+            largest K.
+        code: uint8 [P], YES | UNDECIDED at valid positions, else 0; overwritten with the verdict.
     """
     for i in range(code.size):
         low_x, high_x = max(a[i], b[i]), max(c[i], d[i])
@@ -70,7 +70,7 @@ def fill_levels(heightmap: Any, empty_map: Any, levels: Any) -> None:
 
 @njit(cache=True)
 def _load(levels: Any, top: int, valid: Any, window: Any, tops: Any, codes: Any) -> None:
-    """Copy one mask's map, height limit and valid positions into a run, faster than slices."""
+    """Copy one mask's map, height limit and valid positions into a run; slices would be slower."""
     for i in range(levels.size):
         window[i] = levels[i]
         tops[i] = top
@@ -79,14 +79,14 @@ def _load(levels: Any, top: int, valid: Any, window: Any, tops: Any, codes: Any)
 
 @njit(cache=True)
 def _copy(values: Any, out: Any) -> None:
-    """Copy a flat map, faster than by slices."""
+    """Copy a flat map; slices would be slower."""
     for i in range(out.size):
         out[i] = values[i]
 
 
 @njit(cache=True)
 def _write_mask(codes: Any, out: Any) -> bool:
-    """Write the YES of ``codes`` to ``out``; return whether any code is UNDECIDED."""
+    """Write 1 to ``out`` where a code is YES, else 0; return whether any code is UNDECIDED."""
     undecided = np.uint8(0)
     for i in range(out.size):
         undecided |= codes[i] & UNDECIDED
@@ -122,7 +122,9 @@ def _copy_equals(equal: Any, out: Any, best_level: Any) -> None:
 def central_masks(
     heightmap: Any, empty_map: Any, sides: Any, height: int, levels: Any, out: Any, best_level: Any
 ) -> None:
-    """Compute masks of boxes with central mass and no margin; see :func:`general_masks`.
+    """Compute masks of boxes with the centre of mass in the middle and no margin.
+
+    :func:`general_masks` computes all other masks.
 
     Args:
         heightmap: int16 [N, W, D].
@@ -131,7 +133,8 @@ def central_masks(
         height: H, at most 16383 cells (126 where ``levels`` is uint8).
         levels: uint8 or int16 [N, W, D], scratch.
         out: uint8 [N, A, W, D], written: 1 where the box fits and is supported.
-        best_level: as ``levels`` [N, A, W, D], K under the box where ``out`` is 1; or no entries.
+        best_level: same type as ``levels``, [N, A, W, D], written: the largest K under the box
+            where ``out`` is 1. Not written if it has no entries.
     """
     (n, width, depth), count = heightmap.shape, sides.shape[1]
     cells = width * depth
@@ -186,7 +189,7 @@ def _write_run(
     batch: Any, w: int, d: int, codes: Any, tops: Any, levels: Any, scratch: Any, out: Any,
     flat_out: Any, flat_best: Any,
 ) -> None:  # fmt: skip
-    """Write the masks of a run of boxes with one footprint; undecided cells are solved first."""
+    """Write the masks of a run of boxes with the same footprint; solve undecided cells first."""
     count, cells = out.shape[1], codes.shape[1]
     for j in range(batch.size):
         i = batch[j]
@@ -204,10 +207,10 @@ def _keep_supported(
     plane: Any, buffers: Any, depth: int, w: int, d: int, low: Any, high: Any, whole: Any,
     codes: Any,
 ) -> None:  # fmt: skip
-    """Clear the codes of windows without the best contact in each half and each quadrant.
+    """Clear the codes of windows that do not have their highest contact in each half and quadrant.
 
-    Contact in the four halves leaves a window UNDECIDED, contact in the four quadrants makes it a
-    YES.
+    A window with contact in all four halves stays UNDECIDED. A window with contact in all four
+    quadrants becomes YES.
 
     Args:
         plane: [W · D], K of every column.
@@ -242,14 +245,15 @@ def general_masks(
 ) -> int:  # fmt: skip
     """Compute masks for any centre of mass and safety margin.
 
-    Halves and quadrants begin ``margin`` away from the centre of mass here. Contact reaching into
-    all four quadrants puts the square of half-width ``margin`` around it, and so the disc, inside
-    the hull; none in one of the four halves leaves a side of the hull within ``margin`` of it.
+    Halves and quadrants begin ``margin`` away from the centre of mass here. If contact reaches into
+    all four quadrants, the hull contains the square of half-width ``margin`` around the centre of
+    mass, and so the disc of this radius. If one of the four halves has no contact, a side of the
+    hull lies within ``margin`` of the centre of mass.
 
     Args:
-        at, low, start, unit, margin, whole: of a :class:`marl_pack.stability.centres.CentreTable`
-            for windows as long as the map.
-        heightmap, empty_map, sides, height, levels: as in :func:`central_masks`.
+        at, low, start, unit, margin, whole: the fields of a
+            :class:`marl_pack.stability.centres.CentreTable` for windows as long as the map.
+        heightmap, empty_map, sides, height, levels: see :func:`central_masks`.
         out: uint8 [N, A, W, D], written: OUTSIDE, INSIDE or UNSURE.
 
     Returns:
@@ -311,7 +315,8 @@ def support_mask(
         empty_map: int16 or bool [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H.
-        centres: of mass, with the margin; None: in the middle, without a margin.
+        centres: table of the centres of mass with the margin; None: centres of mass in the middle
+            and no margin.
 
     Returns:
         The mask, bool [N, A, W, D], and the windows int64 [U, 4] (rows n, a, x, y) that exact

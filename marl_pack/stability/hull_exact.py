@@ -13,8 +13,9 @@ import numpy as np
 from marl_pack.installation import njit
 
 YES, UNDECIDED = 2, 1
-"""Codes of a window: its centre of mass is inside the hull, or the exact test must decide. Every
-YES also passes the weaker test: 1 + 1."""
+"""Codes of a window: its centre of mass is inside the hull (YES), or the exact test must decide
+(UNDECIDED). A code is the number of tests that the window passes: a YES also passes the weaker test
+of an UNDECIDED window."""
 
 OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 """Verdicts of the exact test. UNSURE: float64 cannot tell, so exact fractions must decide."""
@@ -23,7 +24,7 @@ ROUNDING = 2.0**-48
 """Relative error of the distance to an edge that float64 never exceeds."""
 
 LOOKUP_CELLS = 64
-"""Windows of more cells than this find the extremes of their rows in tables of the whole map."""
+"""For windows of more cells than this, tables of the whole map give the extremes of their rows."""
 
 
 @njit(cache=True, inline="always")
@@ -45,13 +46,13 @@ def row_extremes(cells: Any, lo: Any, hi: Any) -> None:
 
 @njit(cache=True)
 def envelope(lo: Any, hi: Any, upper: Any, lower: Any) -> tuple[int, int]:
-    """Compute the upper and the lower chain of the hull of the squares of row extremes.
+    """Compute the upper and the lower chain of the hull of cells, given the extremes of each row.
 
     Args:
         lo: int64 [w], first cell of each row.
         hi: int64 [w], last cell of each row (``hi < lo``: the row has none).
         upper: int64 [2w + 2, 2], filled with the upper chain's vertices (x, y), x ascending.
-        lower: int64 [2w + 2, 2], filled with the lower chain's.
+        lower: int64 [2w + 2, 2], filled with the lower chain's vertices (x, y), x ascending.
 
     Returns:
         The number of vertices of the upper and of the lower chain; 0, 0 where no row has a cell.
@@ -107,11 +108,11 @@ def inside(
     lo: Any, hi: Any, upper: Any, lower: Any, x: float, y: float, unit: float, margin: float,
     whole: bool,
 ) -> int:  # fmt: skip
-    """Decide whether (x, y) lies more than ``margin`` inside the hull of the rows' squares.
+    """Decide whether (x, y) lies more than ``margin`` inside the hull of the rows' cells.
 
     Args:
-        lo: int64 [w], as for :func:`envelope`.
-        hi: int64 [w], as for :func:`envelope`.
+        lo: int64 [w], first cell of each row.
+        hi: int64 [w], last cell of each row (``hi < lo``: the row has none).
         upper: int64 [2w + 2, 2], scratch.
         lower: int64 [2w + 2, 2], scratch.
         x: the point's x, in units.
@@ -143,11 +144,12 @@ def inside(
 
 @njit(cache=True)
 def middle_inside(lo: Any, hi: Any, d: int) -> bool:
-    """Return :func:`inside` for the window's middle and no margin, without building the hull.
+    """Return whether the window's middle lies inside the hull, without computing the hull.
 
-    Seen from the middle, the hull passes above it iff the steepest rise to a corner on its left
-    and the steepest to one on its right add up to more than 0 (or a corner stands right above);
-    the same holds below. In half cells all numbers are whole, so fractions are compared exactly.
+    This is :func:`inside` without a margin. Seen from the middle, the hull passes above it iff the
+    steepest rise to a corner on the left and the steepest rise to a corner on the right add up to
+    more than 0, or a corner lies directly above; the same holds below. In half cells all numbers
+    are whole, so fractions are compared exactly.
     """
     w = lo.size
     for side in range(2):
@@ -174,20 +176,30 @@ def middle_inside(lo: Any, hi: Any, d: int) -> bool:
 
 
 @njit(cache=True)
-def _mark_neighbours(levels: Any, top: int, following: Any, preceding: Any) -> None:
-    """Find for every cell of [W, D] the nearest one of level ``top`` from it on, and up to it."""
+def _mark_neighbours(levels: Any, top: int, next_y: Any, previous_y: Any) -> None:
+    """Find the nearest cell of level ``top`` in the same row, for each cell [W, D] and direction.
+
+    If the cell itself has level ``top``, it is the nearest cell in both directions.
+
+    Args:
+        levels: integers [W, D], K of every column.
+        top: the level.
+        next_y: int16 [W, D], written: y of the nearest cell with the same or a larger y, or D.
+        previous_y: int16 [W, D], written: y of the nearest cell with the same or a smaller y, or
+            -1.
+    """
     depth = levels.shape[1]
     for x in range(levels.shape[0]):
         last = -1
         for y in range(depth):
             if levels[x, y] == top:
                 last = y
-            preceding[x, y] = last
+            previous_y[x, y] = last
         last = depth
         for y in range(depth - 1, -1, -1):
             if levels[x, y] == top:
                 last = y
-            following[x, y] = last
+            next_y[x, y] = last
 
 
 @njit(cache=True, inline="always")
@@ -213,7 +225,7 @@ def solve_undecided(
 
     Args:
         codes: uint8 [W · D], the windows' codes.
-        best: integers [W · D], their largest K.
+        best: integers [W · D], the windows' largest K.
         levels: integers [W, D], K of every column.
         w: the windows' cells along x.
         d: the windows' cells along y.
@@ -233,9 +245,9 @@ def solve_undecided(
     upper, lower = scratch[1], scratch[2]
     middle = whole and margin == 0.0 and 2 * x == w * unit and 2 * y == d * unit
     unsure = 0
-    # Large windows come in clusters over the same level: mark its cells once, then look up.
+    # Large windows come in clusters with the same level: mark its cells once, then look them up.
     marks = np.empty((2, width, depth) if w * d > LOOKUP_CELLS else (2, 0, 0), np.int16)
-    following, preceding = marks[0], marks[1]
+    next_y, previous_y = marks[0], marks[1]
     marked = -1
     for position in range((width - w) * depth + depth - d + 1):
         if codes[position] != UNDECIDED:
@@ -244,11 +256,11 @@ def solve_undecided(
         top = best[position]
         if w * d > LOOKUP_CELLS:
             if marked != top:
-                _mark_neighbours(levels, top, following, preceding)
+                _mark_neighbours(levels, top, next_y, previous_y)
                 marked = top
             for i in range(w):
-                lo[i] = following[cx + i, cy] - cy
-                hi[i] = preceding[cx + i, cy + d - 1] - cy
+                lo[i] = next_y[cx + i, cy] - cy
+                hi[i] = previous_y[cx + i, cy + d - 1] - cy
         else:
             _level_extremes(levels, cx, cy, w, d, top, lo, hi)
         if middle:

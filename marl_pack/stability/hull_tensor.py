@@ -1,8 +1,9 @@
 """Convex-hull masks in batched tensor code, for any device.
 
-This is the rule of :mod:`marl_pack.stability.hull_compiled`, with the same quadrants: sliding
-maxima by doubling, here as gathers because each oriented item has its own window, and an exact test
-of the few windows that the quadrants leave undecided. The verdicts are equal cell by cell.
+The rule and its quadrants are those of :mod:`marl_pack.stability.hull_compiled`: sliding maxima by
+doubling, and an exact test of the few windows that the quadrants leave undecided. The maxima are
+computed with gathers here, because each oriented item has another window. The results are equal
+cell by cell.
 """
 
 from __future__ import annotations
@@ -16,29 +17,29 @@ from marl_pack.stability.centres import CentreTable, centre_table
 from marl_pack.stability.hull_exact import ROUNDING
 
 CENTRAL = centre_table(((0.0, 0.0),), 0.0, 0)
-"""The unit of centres in the middle: half a cell. There is no margin."""
+"""Table for centres of mass in the middle and no margin; its unit is half a cell."""
 PAIR_CELLS = 1 << 24
-"""Largest number of elements of the exact test's [windows, points, points, points] at a time."""
+"""Largest number of elements of a tensor [windows, points, points, points] in the exact test."""
 
 
 def _below_chain(
     points: Tensor, present: Tensor, com: Tensor, centres: CentreTable
 ) -> tuple[Tensor, Tensor]:
-    """Decide whether ``com`` lies strictly below the upper chain of each hull, by the margin.
+    """Decide whether ``com`` lies more than the margin below the upper chain of each hull.
 
-    The chain at x is the highest of the lines between a point left and a point right of x, so
-    without a margin one such line above ``com`` is enough. With one, ``com`` is measured against
-    every edge: a pair of points that no other point lies above.
+    The chain at x is the highest of the lines between a point left and a point right of x. So
+    without a margin, one such line above ``com`` is enough. With a margin, the distance of ``com``
+    from every edge is compared; an edge is a pair of points such that no point lies above its line.
 
     Args:
         points: float64 [U, P], height of the hull's boundary points over x = 0 … P - 1, in cells.
         present: bool [U, P], which of them exist.
         com: float64 [U, 2], in units of ``centres``.
-        centres: with the margin and the unit.
+        centres: the table with the margin and the unit.
 
     Returns:
-        Whether it surely does and whether it possibly does, bool [U] each. They are equal where
-        float64 is exact.
+        Whether ``com`` surely lies there and whether it possibly lies there, bool [U] each. Both
+        are equal where float64 is exact.
     """
     size = points.shape[1]
     unit, margin = centres.unit, centres.margin
@@ -87,7 +88,7 @@ def boundary(contact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     count, _, d = contact.shape
     has = contact.any(2)
     last = d - contact.flip(2).byte().argmax(2)  # upper edge of the row's last cell
-    first = contact.byte().argmax(2)  # lower edge of its first
+    first = contact.byte().argmax(2)  # lower edge of the row's first cell
     none = torch.zeros(count, 1, dtype=torch.bool, device=contact.device)
     present = torch.cat((none, has), 1) | torch.cat((has, none), 1)
     absent = torch.full((count, 1), -d - 1, dtype=torch.int64, device=contact.device)
@@ -106,10 +107,10 @@ def inside(contact: Tensor, com: Tensor, centres: CentreTable) -> tuple[Tensor, 
     Args:
         contact: bool [U, w, d], the contact cells that count.
         com: float64 [U, 2], from the window's low corner, in units of ``centres``.
-        centres: with the margin and the unit.
+        centres: the table with the margin and the unit.
 
     Returns:
-        Whether it surely does and whether it possibly does, bool [U] each.
+        Whether ``com`` surely lies there and whether it possibly lies there, bool [U] each.
     """
     count, w, _ = contact.shape
     present, upper, lower = boundary(contact)
@@ -141,12 +142,14 @@ def _largest_levels(
         level: int16 [B, W, D], K of every column.
         sides: int64 [B, 2], the windows' sides w, d.
         low: int64 [B, 2], cells of the parts that begin at the window's low corner.
-        start: int64 [B, 2], where the parts begin that end at its high corner.
-        equal: whether the four quadrants have one size: central mass and no margin.
+        start: int64 [B, 2], first cells of the parts that end at the window's high corner.
+        equal: whether the four quadrants have the same size: centre of mass in the middle and no
+            margin.
         cover: whether the quadrants cover the window: no margin.
 
     Returns:
-        int16 [B, W, D] of the windows, four of these of the quadrants, and four of the halves.
+        int16 [B, W, D] for the windows, four such tensors for the quadrants, and four for the
+        halves.
     """
     w, d = sides[:, 0], sides[:, 1]
     low, high = low.clamp(min=1), (sides - start).clamp(min=1)
@@ -188,7 +191,8 @@ def support_mask(
         empty_map: int or bool [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
         height: H, at most 16383 cells.
-        centres: of mass, with the margin; None: in the middle, without a margin.
+        centres: table of the centres of mass with the margin; None: centres of mass in the middle
+            and no margin.
 
     Returns:
         The mask, bool [N, A, W, D], and the windows int64 [U, 4] (rows n, a, x, y) that exact

@@ -1,8 +1,8 @@
 """Load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123) on a raster.
 
 A box whose centre of mass lies in a polygon of load-bearing contact can itself carry any load
-inside that polygon, so gap cells under its top may count for the next box. A cell counts only if
-its whole square lies in the polygon; a test of one corner alone would be unsound.
+inside that polygon. So cells of its top above a gap may support the next box. A cell counts only if
+its whole square lies in the polygon; it would be unsound to test only one corner of the square.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from marl_pack.stability.hull_tensor import PAIR_CELLS, boundary
 
 
 def lbcp_bearing(bins: Bins) -> Tensor:
-    """Return the columns whose top carries any load, bool [N, W, D], from the placed boxes.
+    """Return the columns whose top can carry any load, bool [N, W, D], from the placed boxes.
 
-    The floor carries everywhere. A box carries on those cells of its top whose whole square lies
-    in the hull of the bearing squares it rests on.
+    The floor can carry any load everywhere. A box can carry it on those cells of its top whose
+    whole square lies in the hull of the load-bearing squares on which the box rests.
     """
     return bins.backend.pick(compiled=_bearing_compiled, tensor=_bearing_tensor)(bins)
 
@@ -35,7 +35,7 @@ def lbcp_bearing(bins: Bins) -> Tensor:
 
 @njit(cache=True)
 def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
-    """Return a chain's y at ``x``, rounded into the hull (sign +1: upper chain, down)."""
+    """Return a chain's y at ``x``, rounded to the inside: down for the upper chain (sign 1)."""
     for i in range(size - 1):
         ax, ay, bx, by = chain[i, 0], chain[i, 1], chain[i + 1, 0], chain[i + 1, 1]
         if ax <= x <= bx:
@@ -123,7 +123,8 @@ def _bearing_tensor(bins: Bins) -> Tensor:
 def _rounded(points: Tensor, present: Tensor) -> Tensor:
     """Return the upper chain of the hull over x = 0 … P - 1, rounded down, int64 [U, P].
 
-    The floor of a maximum is the maximum of the floors, so every pair of points may contribute.
+    A maximum rounded down is the maximum of the numbers rounded down, so all pairs of points are
+    rounded first.
 
     Args:
         points: int64 [U, P], height of the hull's boundary points.

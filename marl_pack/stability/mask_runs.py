@@ -11,16 +11,16 @@ from marl_pack.installation import njit
 
 @njit(cache=True, inline="always")
 def in_bin(w: int, d: int, h: int, width: int, depth: int, height: int) -> bool:
-    """Return whether a box fits into an empty bin; one with a zero side does not."""
+    """Return whether a box fits into an empty bin; a box with a zero side does not."""
     return 0 < w <= width and 0 < d <= depth and 0 < h <= height
 
 
 @njit(cache=True)
 def earlier_equals(sides: Any) -> Any:
-    """Find for each oriented item [N, A, 3] an earlier one of its bin with equal sides.
+    """Find for each oriented item [N, A, 3] an earlier item of the same bin with equal sides.
 
     Returns:
-        int64 [N · A], its index into N · A, or -1 where there is none.
+        int64 [N · A], the index of the earlier item in N · A, or -1 where there is none.
     """
     n, count = sides.shape[:2]
     equal = np.full(n * count, -1, np.int64)
@@ -42,8 +42,8 @@ def _footprint_keys(sides: Any, equal: Any, shape: tuple[int, int], height: int)
     """Number the footprints of oriented items [N · A, 3] that need a mask of their own.
 
     Returns:
-        int64 [N · A], one number a footprint; -1 where the item does not fit into the bin or has an
-        earlier equal. And the number of possible keys.
+        int64 [N · A], the key of each footprint; -1 where the item does not fit into the bin or has
+        an earlier equal item. And the number of possible keys.
     """
     masks = sides.shape[0]
     key = np.empty(masks, np.int64)
@@ -63,9 +63,9 @@ def runs_of_footprints(
     """Order the masks so that equal footprints follow each other, and cut the order into runs.
 
     Returns:
-        The order (indices into N · A, those that do not fit into the bin or have an earlier equal
-        left out) and the limits of the runs in it: at most ``size`` masks each, one footprint a
-        run.
+        The order: indices into N · A, without the items that do not fit into the bin or have an
+        earlier equal item. And the limits of the runs in it: a run has at most ``size`` masks, all
+        with the same footprint.
     """
     masks = sides.shape[0]
     key, keys = _footprint_keys(sides, equal, shape, height)

@@ -1,4 +1,4 @@
-"""The oriented item that a stability rule judges: one item per bin in several orientations."""
+"""The oriented item, an input of the stability rules: one item per bin in several orientations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marl_pack.stability.parameters import NO_OFFSET
 
 @dataclass(frozen=True)
 class OrientedItem:
-    """One item per bin in A orientations; without offsets or weight, mass is uniform."""
+    """One item per bin in A orientations; by default its mass is central and equals its volume."""
 
     sides: Tensor  # int16 [N, A, 3]  w, d, h along x, y, z; a zero side: orientation not allowed
     # for each orientation, the centre of mass from the geometric centre in fractions of w and d

@@ -1,17 +1,18 @@
 """Algorithms 1 and 2 of Zhou et al. 2024, step by step as they are printed, with OpenCV.
 
-This is where a reader of the paper can compare line by line. The package plays by
-:mod:`marl_pack.stability.reference` and its fast versions, which depart from the page where it
-would let boxes fall, or forbid what stands:
+Readers can compare this module with the paper line by line. The package itself uses
+:mod:`marl_pack.stability.reference` and its fast versions. They differ from the paper where it
+would let boxes fall or forbid stable placements:
 
-- *Squares, not points.* The paper takes the hull of the highest points of a heightmap in pixels. A
-  cell is a square: on points the centre is off by half a cell, which 5 mm pixels hide and a
-  10 × 10 grid does not.
+- *Squares, not points.* The paper takes the hull of the highest points of a heightmap in pixels. In
+  the package a cell is a square. With points, the centre is off by half a cell, which matters
+  little for pixels of 5 mm, but much on a 10 × 10 grid.
 - *Strictly inside.* ``center.within(hull)`` does not say whether the hull's edge counts. A box that
-  is balanced on an edge does not stand, so there it never counts.
-- *One rule everywhere.* Algorithm 1 accepts every box on the floor. Here the floor is tested like
-  any other contact, so a margin or a centre of mass off the middle counts on the floor too.
-- *Any centre of mass.* Algorithm 1 tests the window's centre; the package any known centre.
+  is balanced on an edge does not stand, so in the package the edge never counts.
+- *One rule everywhere.* Algorithm 1 accepts every box on the floor. The package tests the floor
+  like any other contact, so a margin or a centre of mass off the middle counts on the floor too.
+- *Any centre of mass.* Algorithm 1 tests the window's centre. The package tests any known centre of
+  mass.
 
 All lengths are cells. OpenCV comes with ``pip install -e ".[reference]"``.
 """
@@ -31,8 +32,9 @@ Map = NDArray[np.integer[Any]]
 Reading = Literal["points", "squares"]
 """How a cell of p_f becomes points of a polygon, and whether the polygon's edge counts.
 
-``points``: its indices are one point, and the edge counts, as the paper may be read. ``squares``:
-the four corners of its square, and the edge does not count: the package's reading.
+``points``: a cell gives one point, its indices, and the edge counts; this is one way to read the
+paper. ``squares``: a cell gives the four corners of its square, and the edge does not count; this
+is how the package reads it.
 """
 
 
@@ -56,7 +58,7 @@ def convex_hull_alpha(
         Bool [W, D]: whether the object is stable with its low corner at (x, y).
 
     Raises:
-        ModuleNotFoundError: if OpenCV is missing; names the extra that brings it.
+        ModuleNotFoundError: if OpenCV is missing; the message names the extra that installs it.
     """
     (w, d, h), (width, depth) = item, heightmap.shape
     action_map = np.zeros((width, depth), np.bool_)
@@ -79,7 +81,7 @@ def convex_hull_1(
 ) -> NDArray[np.bool_]:
     """Return the stable action map of convexHull-1 (Zhou et al. 2024, section III-A), bool [W, D].
 
-    It is Algorithm 1 without the empty map: all the highest points p_f count, whatever is below.
+    It is Algorithm 1 without the empty map: all the highest points p_f count, even above a gap.
     """
     return convex_hull_alpha(heightmap, np.zeros_like(heightmap), item, bin_height, reading)
 
@@ -123,6 +125,6 @@ def _centre_within_hull(cells: NDArray[np.bool_], reading: Reading) -> bool:
     if reading == "points":
         hull = cv2.convexHull(np.argwhere(cells).astype(np.int32))
         return bool(cv2.pointPolygonTest(hull, (w / 2, d / 2), False) >= 0)
-    # In half cells, so that the centre has whole coordinates, of which OpenCV's test is exact.
+    # In half cells, so that the centre has whole coordinates: OpenCV's test is exact on these.
     hull = cv2.convexHull((2 * corners(cells)).astype(np.int32))
     return bool(cv2.pointPolygonTest(hull, (float(w), float(d)), False) > 0)

@@ -1,4 +1,4 @@
-"""Parameters of rules and of items: thresholds of support areas and centres of mass."""
+"""Parameters of rules and of items: thresholds of supported areas, and centres of mass."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from marl_pack.checks import real_number, shown, whole_number
 Thresholds = tuple[tuple[float, int], ...]
 
 PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
-"""(share of the bottom face, corners): more than the share and at least so many corners."""
+"""The thresholds of the paper, pairs (share, corners). A box is stable if, for one of the pairs,
+more than this share of its bottom face and at least so many of its corners are supported."""
 CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
 """The thresholds of the authors' released code."""
 THRESHOLDS = {"paper": PAPER, "code": CODE}

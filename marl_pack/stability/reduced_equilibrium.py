@@ -1,7 +1,7 @@
 r"""The reduced linear program of one box placed on a stack in equilibrium, in compiled loops.
 
 :mod:`marl_pack.stability.static_equilibrium` solves the linear program of a whole stack. A mask
-asks thousands of such questions about stacks that stand, so the program is reduced:
+needs thousands of such solutions, for stacks that are known to stand, so the program is reduced:
 
 - *Bearing cells.* If the column below a contact cell is filled to the floor, a force there can be
   passed straight down through the column without disturbing any box in it. Letting the ground push
@@ -14,12 +14,12 @@ asks thousands of such questions about stacks that stand, so the program is redu
   makes each such contact a ground contact: the projection of :math:`C` is :math:`C'`, and
   :math:`C \supseteq C_g \times C'`. Each grounded weight is interior to :math:`C_g`. Hence
   :math:`w \in \operatorname{int} C \iff w' \in \operatorname{int} C'`.
-- *Components.* Boxes that no chain of contacts through ungrounded boxes joins to the new one keep
-  the balance they had: the cone is a product.
+- *Components.* Boxes that are not joined to the new box by a chain of contacts through ungrounded
+  boxes keep their balance: the cone is a product.
 
-What remains (a handful of boxes) goes to a small dense simplex, whose forces are put back into the
-equations. Where they do not confirm its verdict, or it is nearly a tie, it is UNSURE, and the same
-program is solved in whole numbers (:func:`stands_by_fractions`).
+A small dense simplex method solves the program of the few boxes that remain. The forces that it
+finds are put back into the equations. If they do not confirm the result, or the result is nearly a
+tie, it is UNSURE, and the same program is solved in whole numbers (:func:`stands_by_fractions`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _touches(a: Any, b: Any) -> bool:
 
 @njit(cache=True, inline="always")
 def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
-    """Find where the ground pushes at a box: the vertices of the hull of its bearing cells.
+    """Find where the ground pushes a box: at the vertices of the hull of its bearing cells.
 
     Args:
         bearing: bool [w, d], contact cells over columns that are filled to the floor.
@@ -110,7 +110,7 @@ def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing
 
 @njit(cache=True)
 def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[Any, Any, Any]:
-    """Replay a stack to find its grounded boxes, and where the ground pushes at the others.
+    """Replay a stack to find its grounded boxes, and where the ground pushes the other boxes.
 
     Args:
         boxes: int64 [≥ n, 6], rows x, y, z, w, d, h in order of placement.
@@ -120,7 +120,7 @@ def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[An
 
     Returns:
         Grounded boxes bool [n + 1], ground points float64 [n + 1, 4W + 4, 2] and their number
-        int64 [n + 1]; the last row of each is left for a new box.
+        int64 [n + 1]; the last row of each is free for a new box.
     """
     heightmap = np.zeros(shape, np.int64)
     empty_map = np.zeros(shape, np.int64)
@@ -181,9 +181,9 @@ def _system(
     boxes: Any, loads: Any, grounded: Any, points: Any, count: Any, members: Any, row: Any,
     forces: int,
 ) -> tuple[Any, Any]:  # fmt: skip
-    """Build the equations ``a f = weight`` of the members' balance of force and moments.
+    """Build the equations ``a f = weight`` that balance forces and moments of the members.
 
-    Weights are in mean weights of the members, moments in each box's longer side.
+    Weights are divided by the members' mean weight, moments by each box's longer side.
     """
     size, n = members.size, grounded.size
     a = np.zeros((3 * size, forces))
@@ -228,13 +228,13 @@ def stands(
         boxes: int64 [n + 1, 6], rows x, y, z, w, d, h.
         loads: float64 [n + 1, 3], weight and x, y of each centre of mass.
         n: index of the new box.
-        grounded: bool [n + 1], as from :func:`survey`.
+        grounded: bool [n + 1], the grounded boxes, from :func:`survey`.
         points: float64 [n + 1, V, 2], ground points of each box.
-        count: int64 [n + 1], their number.
-        whole: whether to solve all ungrounded boxes, not only those that the new one may disturb.
+        count: int64 [n + 1], number of ground points of each box.
+        whole: whether to solve all ungrounded boxes, or only those that the new box may disturb.
 
     Returns:
-        NO, YES or UNSURE, where the simplex cannot be trusted or it is nearly a tie.
+        YES or NO; UNSURE if the simplex method cannot be trusted or the result is nearly a tie.
     """
     members, row, forces = _component(boxes, n, grounded, count, whole)
     a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
@@ -257,11 +257,11 @@ def stands_by_fractions(
     """Decide in exact arithmetic what :func:`stands` decides.
 
     Args:
-        boxes: int64 [n + 1, 6], rows x, y, z, w, d, h in order of placement; the last one is new.
-        loads: float64 [n, 3], of the boxes before; decimals mean what they say.
+        boxes: int64 [n + 1, 6], rows x, y, z, w, d, h in order of placement; the last box is new.
+        loads: float64 [n, 3], loads of the other boxes; decimals are taken exactly.
         new: the load of the new box.
         shape: (W, D).
-        whole: as for :func:`stands`.
+        whole: see :func:`stands`.
     """
     n = len(boxes) - 1
     scratch = np.empty((3, 2 * shape[0] + 2, 2), np.int64)
@@ -280,5 +280,7 @@ def stands_by_fractions(
                 x0, y0, x1, y1 = map(int, _overlap(boxes[i], boxes[j]))
                 for x, y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
                     forces.append(Force(x, y, int(row[i]), int(row[j])))
-    own = [new if i == n else Load(*map(exact, loads[i].tolist())) for i in members.tolist()]
-    return stands_exactly(own, forces)
+    exact_loads = [
+        new if i == n else Load(*map(exact, loads[i].tolist())) for i in members.tolist()
+    ]
+    return stands_exactly(exact_loads, forces)

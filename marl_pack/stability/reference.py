@@ -1,10 +1,10 @@
 """The definition of every rule, one window at a time, in plain NumPy.
 
-Nothing here is fast. The batched code is tested cell by cell against these functions, which define
-what a rule means. The arithmetic is exact: a float means the decimal that is written for it, so 0.1
-is one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the
-corners of the contact squares, and a centre of mass must lie strictly inside it.
-``docs/reproduce.md`` lists where this departs from the paper.
+These functions are slow. They define what a rule means, and the batched code is tested against them
+cell by cell. The arithmetic is exact: a float means the decimal that is printed for it, so 0.1 is
+one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the corners
+of the contact squares, and a centre of mass must lie strictly inside it. ``docs/reproduce.md``
+lists where this differs from the paper.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Map = NDArray[np.integer]
 def place_box(
     heightmap: Map, empty_map: Map, corner: tuple[int, int], sides: tuple[int, int, int]
 ) -> tuple[int, int]:
-    """Place one box from above, in place (Algorithm 2); return resting height and wasted cells."""
+    """Place one box, update both maps (Algorithm 2); return resting height and wasted cells."""
     (x, y), (w, d, h) = corner, sides
     window = np.s_[x : x + w, y : y + d]
     z = int(heightmap[window].max())
@@ -80,12 +80,12 @@ def deeper(polygon: list[Point], point: Point, margin: Number) -> bool:
 def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
     """Return whether ``com`` lies more than ``margin`` inside the hull of ``cells``' squares.
 
-    The arithmetic is that of Python's whole numbers and fractions, so it is exact.
+    The arithmetic uses Python's whole numbers and fractions, so it is exact.
 
     Args:
-        cells: bool [w, d].
-        com: the centre of mass from the low corner of ``cells``; floats mean their decimals.
-        margin: cells, ≥ 0; a float means its decimal.
+        cells: bool [w, d], the supporting cells.
+        com: the centre of mass from the low corner of ``cells``; floats are taken as decimals.
+        margin: number of cells, ≥ 0; a float is taken as a decimal.
     """
     if not cells.any():
         return False
@@ -96,14 +96,14 @@ def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
 def hull(heights: Map, bearing: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
     """Return the verdict of ``hull_1``, ``hull_alpha`` and ``lbcp`` on one window.
 
-    Only contact cells in ``bearing`` count. It is all true for hull_1 (the paper's p_f),
-    ``empty_map == 0`` for hull_alpha (p_f', Algorithm 1) and :func:`lbcp_bearing` for lbcp.
+    Only contact cells in ``bearing`` count. ``bearing`` is true everywhere for hull_1 (the paper's
+    p_f), ``empty_map == 0`` for hull_alpha (p_f', Algorithm 1) and :func:`lbcp_bearing` for lbcp.
     """
     return supported((heights == heights.max()) & bearing, com, margin)
 
 
 def area_ratio(heights: Map, thresholds: tuple[tuple[Number, int], ...]) -> bool:
-    """Return the verdict of Zhao et al. 2021 by the supported share and corners of the bottom."""
+    """Return whether enough of the bottom face and its corners is supported (Zhao et al. 2021)."""
     contact = heights == heights.max()
     count = int(contact[[0, 0, -1, -1], [0, -1, 0, -1]].sum())
     return any(
@@ -113,11 +113,11 @@ def area_ratio(heights: Map, thresholds: tuple[tuple[Number, int], ...]) -> bool
 
 
 def lbcp_bearing(size: tuple[int, int], boxes: Map) -> NDArray[np.bool_]:
-    """Return the cells [W, D] whose top carries any load, by load-bearable convex polygons.
+    """Return the cells [W, D] whose top can carry any load, by load-bearable convex polygons.
 
-    The floor carries everywhere. A box carries on those cells of its top whose whole square lies
-    in the hull of the bearing squares it rests on (Gao et al. 2025, arXiv 2507.09123; testing only
-    one corner of the square instead of all four would be unsound).
+    The floor can carry any load everywhere. A box can carry it on those cells of its top whose
+    whole square lies in the hull of the load-bearing squares on which the box rests (Gao et al.
+    2025, arXiv 2507.09123). It would be unsound to test only one corner of the square.
     """
     heightmap, empty_map = np.zeros(size, np.int64), np.zeros(size, np.int64)
     bearing = np.ones(size, dtype=np.bool_)
@@ -151,13 +151,13 @@ def window_mask(
 def equilibrium(boxes: Map, loads: Sequence[tuple[Number, Number, Number]]) -> bool:
     """Return whether a whole stack is in strict static equilibrium (Wang & Hauser 2021).
 
-    A stack is iff forces at the corners of all contacts balance its weights, and all of them are
-    positive. The textbook simplex method finds, in fractions, the largest force that all of them
-    may have. It is slow: for a few boxes.
+    It is iff positive forces at the corners of all contacts can balance its weights. The textbook
+    simplex method computes, in fractions, the largest value that the smallest force can have. It is
+    slow: use it for a few boxes.
 
     Args:
         boxes: whole numbers [n, 6], rows x, y, z, w, d, h.
-        loads: weight and x, y of the centre of mass of each box; floats mean their decimals.
+        loads: weight and x, y of the centre of mass of each box; floats are taken as decimals.
     """
     rows = [[int(value) for value in row] for row in boxes]
     centres = [tuple(map(exact, load)) for load in loads]
@@ -185,7 +185,7 @@ def equilibrium(boxes: Map, loads: Sequence[tuple[Number, Number, Number]]) -> b
 def _largest_least_force(a: list[list[Fraction]], weights: list[Fraction]) -> Fraction:
     """Solve ``max t, a f = weights, f ≥ t``; return 0 where no ``f ≥ 0`` solves it.
 
-    Two phases of the simplex method with Bland's rule. The variables are f - t, t, and an error
+    This is the two-phase simplex method with Bland's rule. The variables are f - t, t, and an error
     for each equation.
     """
     m, n = len(a), len(a[0]) if a else 0

@@ -1,7 +1,7 @@
 """The stability rules and the table that names them.
 
-The code that computes the masks is imported at the first mask, so that names and parameters of the
-rules are known at once.
+The code that computes masks is imported with the first mask, so that the names and parameters of
+the rules are available without it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ in each orientation and is stable by the rule. Parameters are bound beforehand
 (:func:`functools.partial`)."""
 
 
-@cache  # an import takes as long as a tenth of a mask
+@cache  # an import statement takes a tenth of the time of a mask
 def _hull_mask(backend: Backend) -> Callable[..., Any]:
-    """Return the code of convex-hull masks."""
+    """Return the function that computes convex-hull masks."""
     from marl_pack.stability import hull_compiled, hull_tensor
 
     return backend.pick(compiled=hull_compiled.support_mask, tensor=hull_tensor.support_mask)
@@ -41,7 +41,7 @@ def _hull_mask(backend: Backend) -> Callable[..., Any]:
 
 @cache
 def _area_mask(backend: Backend) -> Callable[..., Any]:
-    """Return the code of masks by supported area."""
+    """Return the function that computes masks by supported area."""
     from marl_pack.stability import support_area
 
     return backend.pick(compiled=support_area.mask_compiled, tensor=support_area.mask_tensor)
@@ -72,7 +72,7 @@ def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 
     Args:
         bins: N bins.
-        item: their items in A orientations.
+        item: the bins' items in A orientations.
         margin: cells by which the support polygon is shrunk.
 
     Returns:
@@ -84,8 +84,8 @@ def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """Return the mask of convexHull-α (Algorithm 1): only contact over filled columns counts.
 
-    Sound for any masses and for whatever the rule places later: each weight goes straight down
-    through filled columns. Arguments as :func:`hull_1`.
+    The rule is sound for any masses and for all boxes that it places later, because each weight
+    goes straight down through filled columns. The arguments are those of :func:`hull_1`.
     """
     return _supported(bins, item, bins.empty_map, margin)
 
@@ -93,8 +93,8 @@ def hull_alpha(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 def lbcp(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
     """Return the mask of load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123).
 
-    Gap cells inside a box's support polygon count as well. The polygons are replayed from
-    ``bins.boxes``. Arguments as :func:`hull_1`.
+    Cells above a gap also count if they lie inside a box's support polygon. The polygons are
+    computed from ``bins.boxes``. The arguments are those of :func:`hull_1`.
     """
     from marl_pack.stability.load_bearing import lbcp_bearing
 
@@ -106,9 +106,9 @@ def area_ratio(bins: Bins, item: OrientedItem, thresholds: Thresholds | str = "p
 
     Args:
         bins: N bins.
-        item: their items; the centre of mass is ignored.
+        item: the bins' items; their centres of mass are ignored.
         thresholds: ``"paper"`` (60 % and 4 corners, 80 % and 3, 95 %), ``"code"`` (50 / 85 / 95, as
-            the authors' code has it), or pairs (share, corners); shares must be exceeded.
+            in the authors' code), or pairs (share, corners). More than the share must be supported.
     """
     pairs = check_thresholds(thresholds)
     mask: Tensor = _area_mask(bins.backend)(bins.heightmap, item.sides, bins.height, pairs)
@@ -125,8 +125,9 @@ def equilibrium(
 
     Args:
         bins: N bins whose stacks stand; with ``check_stack`` any bins.
-        item: their items in A orientations.
-        margin: the centre of mass may lie anywhere within so many cells of its place.
+        item: the bins' items in A orientations.
+        margin: the stack must stand with the item's centre of mass anywhere within so many cells of
+            its position.
         check_stack: whether to check that the stacks stand instead of assuming it.
     """
     from marl_pack.stability.equilibrium_masks import equilibrium_mask
@@ -138,7 +139,7 @@ def equilibrium(
 def none(bins: Bins, item: OrientedItem) -> Tensor:
     """Return where the item fits into the bin, placed from above, without a stability rule.
 
-    A baseline for comparisons, and for tests of the judge.
+    This is a baseline for comparisons, and for tests of the physics simulation.
     """
     return area_ratio(bins, item, ((0.0, 0),))
 
@@ -155,7 +156,7 @@ RULES: dict[str, Callable[..., Tensor]] = {
 
 
 def unknown_rule(name: object) -> ValueError:
-    """Return the error that there is no such rule; it says which one was probably meant."""
+    """Return the error for an unknown rule; it suggests the nearest name."""
     guess = renamed.guess(name, RULES) if isinstance(name, str) else ""
     return ValueError(f"unknown stability rule {shown(name)}: one of {', '.join(RULES)}{guess}")
 

@@ -1,7 +1,7 @@
 """A small dense simplex method for the linear programs of static equilibrium.
 
-These programs have a dozen rows and a few dozen columns, are degenerate, and are solved by the
-thousand: the call of a library costs a hundred times as much as the pivots.
+These programs have a dozen rows and a few dozen columns, and are degenerate. Thousands of them are
+solved, and the call of a library would take a hundred times as long as the pivots.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from marl_pack.installation import njit
 NEAR = 1e-6
 """Least force, or least error of the equations, in mean weights, above which float64 decides."""
 RESIDUAL = 1e-9
-"""Largest sum of the equations' errors that is left to rounding."""
+"""Largest sum of the equations' errors that counts as rounding."""
 
 SMALLEST_PIVOT = 1e-6
-"""A division by less than this may blow up rounding errors, so float64 is not trusted then."""
+"""A division by a smaller number may magnify rounding errors, so float64 is not trusted then."""
 
 
 @njit(cache=True, inline="always")
 def nearly_a_tie(force: float, reach: float) -> bool:
     """Return whether rounding errors might change the sign of a least force.
 
-    A contact is at least one cell wide, so to make up for an error takes at most as many times the
-    error as the boxes reach.
+    A contact is at least one cell wide, so the forces that balance an error are at most ``reach``
+    times as large as the error.
 
     Args:
-        force: as :func:`max_least_force` returns it.
+        force: the least force, from :func:`max_least_force`.
         reach: cells from one end of the boxes to the other.
     """
     return abs(force) <= max(NEAR, 2 * RESIDUAL * reach)
@@ -51,11 +51,12 @@ def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
 def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     """Minimise the last row's objective by the simplex method, until it is below ``-enough``.
 
-    Largest coefficient first, and among tied rows (the moments' right-hand sides are all 0) the
-    largest pivot, which keeps the numbers accurate; Bland's rule once that might cycle.
+    The column with the largest coefficient enters the basis. Among tied rows (the moments'
+    right-hand sides are all 0) the row with the largest pivot leaves it, which keeps the numbers
+    accurate. After many iterations, which may be a cycle, Bland's rule is used.
 
     Returns:
-        Whether it ended as it should, within the limit on iterations.
+        Whether the method ended regularly, within the limit on iterations.
     """
     rows = basis.size
     for iteration in range(200 * rows + 1000):
@@ -84,7 +85,7 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
                 if ratio < best - 1e-13 or better:
                     row, best = i, ratio
         if row < 0 or table[row, column] < SMALLEST_PIVOT:
-            return False  # forces are bounded by the weights, so a row exists but for rounding
+            return False  # only by rounding: forces are bounded by the weights, so a row exists
         _pivot(table, basis, row, column)
     return False
 
@@ -123,10 +124,10 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool, An
         enough: a value of t at which the search may stop.
 
     Returns:
-        The optimum, or the first value above ``enough``; where no ``f ≥ 0`` solves it, minus the
-        least sum of the equations' errors. And whether the forces, put back into the equations,
-        confirm it: false where rounding errors have corrupted the tableau. And the basis int64 [R]:
-        columns of a, m for t, or m + 1 + r for the error of equation r.
+        The optimum, or the first value above ``enough``; if no ``f ≥ 0`` solves the equations,
+        minus the smallest possible sum of their errors. Whether the forces, put back into the
+        equations, confirm this value: false if rounding errors have corrupted the tableau. The
+        basis int64 [R]: columns of a, m for t, or m + 1 + r for the error of equation r.
     """
     rows, columns = a.shape
     table = np.zeros((rows + 1, columns + 2))  # g, t, right-hand side; objective in the last row

@@ -2,13 +2,13 @@ r"""Exact static equilibrium of a whole stack (Wang & Hauser, T-RO 2021).
 
 A stack of boxes stands if vertical forces :math:`f \ge 0` at the corners of every contact
 rectangle (box on box, box on floor) balance force and moment of every box, :math:`A f = w`. It
-stands *strictly* if it still does after any small shift of the weights, that is if :math:`w` is in
+stands *strictly* if it also stands after any small shift of the weights, that is if :math:`w` is in
 the interior of the cone :math:`\{A f : f \ge 0\}`. Every box rests on contact of nonzero area, so
-:math:`A` has full row rank and the interior is :math:`\{A f : f > 0\}`: the linear program
-:math:`\max t,\ A f = w,\ f \ge t` decides, strictly standing iff its optimum is positive.
+:math:`A` has full row rank and the interior is :math:`\{A f : f > 0\}`. So the stack stands
+strictly iff the linear program :math:`\max t,\ A f = w,\ f \ge t` has a positive optimum.
 
-:func:`in_equilibrium` decides that for a whole stack, with SciPy's HiGHS and near a tie in exact
-arithmetic, and is the reference for :mod:`marl_pack.stability.equilibrium_masks`.
+:func:`in_equilibrium` decides this for a whole stack, with SciPy's HiGHS or, near a tie, in exact
+arithmetic. It is the reference for :mod:`marl_pack.stability.equilibrium_masks`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 
 NEAR = 1e-5
-"""Least force, in mean weights of the stack, above which HiGHS is trusted: it balances to 1e-7.
-Below, exact arithmetic decides (:mod:`marl_pack.stability.exact_equilibrium`)."""
+"""Least force, in mean weights of the stack, above which HiGHS is trusted; its forces balance up to
+1e-7. Below, exact arithmetic decides (:mod:`marl_pack.stability.exact_equilibrium`)."""
 MAX_LENGTH = 1 << 31
 """Coordinates of boxes lie below this number."""
 
@@ -76,15 +76,15 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
         loads: float [n, 3], weight and x, y of each centre of mass; uniform density by default.
 
     Returns:
-        The optimum, less what the solver's errors may add to it; infinity for no boxes, -inf if no
-        ``f ≥ 0`` balances the stack.
+        The optimum minus the largest possible effect of the solver's errors; infinity for no boxes,
+        -inf if no ``f ≥ 0`` balances the stack.
     """
     n = len(boxes)
     if n == 0:
         return np.inf
     loads = uniform_loads(boxes) if loads is None else loads
     pairs, rectangles = contacts(boxes)
-    points = rectangles[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 2)  # four corners of each
+    points = rectangles[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 2)  # four corners each
     upper, lower = np.repeat(pairs, 4, axis=0).T
     force = np.arange(len(points))
     box, sign = np.concatenate((upper, lower)), np.repeat((1.0, -1.0), len(points))
@@ -109,8 +109,8 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
     result = linprog(cost, A_eq=spread, b_eq=weight, bounds=(0, None), method="highs")
     if result.status != 0:
         return -np.inf
-    # Its forces balance to an absolute error; to make up for that takes as many times the error as
-    # the longest arm has cells, since a contact is at least one cell wide.
+    # HiGHS balances forces up to an absolute error. The forces that balance this error are at most
+    # the error times the longest arm in cells, since a contact is at least one cell wide.
     error = float(np.abs(spread @ result.x - weight).sum()) * float(np.abs(arm).max(initial=1.0))
     return float(-result.fun) - error
 
@@ -118,17 +118,17 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
 def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
     """Return whether a whole stack is in strict static equilibrium.
 
-    The verdict is exact: decimals in ``loads`` mean what they say. It takes about 2 ms for 20
-    boxes, longer where the stack is nearly a tie.
+    The result is exact: decimals in ``loads`` are taken exactly. It takes about 2 ms for 20 boxes,
+    and longer if the stack is nearly a tie.
 
     Args:
-        boxes: whole numbers [n, 6], rows x, y, z, w, d, h in cells. A box that rests neither on
-            another one nor on z = 0 falls.
+        boxes: whole numbers [n, 6], rows x, y, z, w, d, h in cells. A box falls if it rests neither
+            on another box nor on the floor z = 0.
         loads: float [n, 3], weight and x, y of each centre of mass; uniform density by default.
 
     Raises:
-        ValueError: for a box without volume, two that overlap, or a load that is not finite or has
-            no positive weight; the message says which.
+        ValueError: for a box without volume, two boxes that overlap, or a load that is not finite
+            or has no positive weight; the message says which.
     """
     stack = check_boxes(boxes)
     if not len(stack):
@@ -159,7 +159,7 @@ def stands(boxes: NDArray[np.int64], loads: Sequence[Load]) -> bool:
 
 
 def _components(n: int, pairs: NDArray[np.int64]) -> list[list[int]]:
-    """Return the boxes that contacts join, as lists of their indices, the smallest first."""
+    """Return lists of the indices of boxes that contacts join, the shortest list first."""
     touching = pairs[pairs[:, 1] != GROUND]
     graph = csr_array((np.ones(len(touching)), touching.T), shape=(n, n))
     _, labels = connected_components(graph, directed=False)
@@ -209,11 +209,11 @@ def whole_cells(name: str, values: ArrayLike) -> NDArray[np.int64]:
     """Return ``values`` as whole numbers of cells, int64.
 
     Args:
-        name: of the values, for messages.
-        values: whole numbers of any type; floats without a fraction pass.
+        name: name of the values, for messages.
+        values: whole numbers of any type; floats without a fraction are allowed.
 
     Raises:
-        ValueError: if one is not a whole number, or too large.
+        ValueError: if a value is not a whole number or is too large.
     """
     try:
         array = np.asarray(values)

@@ -1,6 +1,6 @@
-"""The support area rule (Zhao et al. 2021): enough of a box's bottom face and enough corners.
+"""The rule of the supported area (Zhao et al. 2021) of a box's bottom face, and its corners.
 
-The rule is not sound: it ignores the centre of mass, and everything below the box that carries.
+The rule is not sound: it ignores the centre of mass, and whether the boxes below are supported.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from marl_pack.stability.parameters import Thresholds
 def _fill_masks(
     heightmap: Any, sides: Any, height: int, fewest: Any, corners: Any, out: Any
 ) -> None:
-    """Write the masks uint8 [N, A, W, D].
+    """Write the masks uint8 [N, A, W, D] to ``out``.
 
-    ``fewest`` int64 [N, A, T]: supported cells that each of T thresholds needs, with its
-    ``corners`` int64 [T].
+    ``fewest`` int64 [N, A, T] is the number of supported cells that each of T thresholds needs;
+    ``corners`` int64 [T] is the number of supported corners that it needs.
     """
     n, width, depth = heightmap.shape
     cells = width * depth
@@ -70,7 +70,7 @@ def _fill_masks(
 def _fewest_cells(sides: Tensor, thresholds: Thresholds) -> Tensor:
     """Compute how many supported cells exceed the share of each threshold, int64 [N, A, T].
 
-    The arithmetic is exact: 60 % of 5 cells are 3 cells, so 4 exceed them.
+    The arithmetic is exact: 60 % of 5 cells are 3 cells, so 4 cells exceed this share.
     """
     faces = sides[..., 0].long() * sides[..., 1].long()
     columns = []
@@ -106,9 +106,9 @@ def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thr
 
 
 def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
-    """Compute the masks of the rule in tensor code; arguments as :func:`mask_compiled`.
+    """Compute the masks of the rule in tensor code; the arguments are those of mask_compiled.
 
-    The cells at each level are counted by a summed-area table.
+    A summed-area table counts the cells at each level.
     """
     n, width, depth = heightmap.shape
     count = sides.shape[1]
