@@ -62,14 +62,14 @@ def check_writable(path: Path) -> None:
     except OSError as error:  # such as a link to itself
         raise ValueError(f"{path}: {error.strerror}") from None
     if status is not None and not os.access(path, os.W_OK):
-        raise ValueError(f"{path}: may not be written to")
+        raise ValueError(f"{path}: is not writable")
     if _written_through(path, status):
         return
     folder = Path(os.path.realpath(path)).parent
     if not folder.is_dir():
         raise ValueError(f"{path}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK):
-        raise ValueError(f"{path}: the folder {folder} may not be written to")
+        raise ValueError(f"{path}: the folder {folder} is not writable")
 
 
 def same_plain_file(a: Path, b: Path) -> bool:

@@ -112,9 +112,9 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
             raise ValueError(f"{member.filename} has an unknown version of header, {version}")
         shape, _, dtype = NPY_HEADERS[version](file)
         if dtype.hasobject or not dtype.itemsize:
-            raise ValueError(f"{member.filename} has no plain numbers or texts, but {dtype}")
+            raise ValueError(f"{member.filename} needs plain numbers or texts, not {dtype}")
         if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"{member.filename} has another size than its header, {shape}")
+            raise ValueError(f"{member.filename} does not have the size in its header, {shape}")
     with archive.open(member) as file:
         array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
     return array

@@ -63,7 +63,7 @@ class _Uncached:
             cls.warned = True
             warnings.warn(
                 "compiled code cannot be cached, so each process compiles it again; set "
-                f"NUMBA_CACHE_DIR to a folder that may be written to ({reason})",
+                f"NUMBA_CACHE_DIR to a writable folder ({reason})",
                 stacklevel=2,
             )
 

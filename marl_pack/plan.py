@@ -368,7 +368,7 @@ class Plan:
                     _check_row(row, "it")
                     rows.append(row)
                 if sizes.setdefault(row[1], size) != size:
-                    raise ValueError(f"bin {row[1]} has another size than before")
+                    raise ValueError(f"bin {row[1]} has different sizes")
                 units.add(number_in(unit) if unit else None)
             except ValueError as error:
                 raise ValueError(f"{source}: box {number}: {error}") from None

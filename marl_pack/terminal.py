@@ -115,7 +115,7 @@ class Parser(argparse.ArgumentParser):
                 guess = renamed.guess(option, self._option_string_actions)
                 self.error(f"unknown option {shown(option)}{guess or '; --help lists them'}")
         if unknown:
-            self.error(f"{shown(unknown[0])}: belongs to no option")
+            self.error(f"{shown(unknown[0])}: does not belong to an option")
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

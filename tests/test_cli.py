@@ -39,7 +39,7 @@ MISTAKES = [
     ("evaluate --rule hull_apha", "'hull_apha': needs one of .*; did you mean 'hull_alpha'"),
     ("evaluate --items cut3", "cut3: no such file; .*; did you mean 'cut"),
     ("evaluate --save-stacks plans.txt", "plans.txt: needs one of the endings .npz, .json, .csv"),
-    ("evaluate rs", "'rs': belongs to no option"),
+    ("evaluate rs", "'rs': does not belong to an option"),
     ("evaluate --policy rs --plan rollout=8", "'rollout=8': needs rollouts=K, top=M or depth=D"),
     ("export types_125", "'types_125': needs one of .*; did you mean 'types125'"),
     ("export rs --formt onnx", "did you mean '--format'"),

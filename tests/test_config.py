@@ -78,7 +78,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: clip"),
     (["--sed=1"], r"unknown key 'sed'; did you mean 'seed'\? Keys: device, evaluation"),
     (["--ppo.gamma=much"], r"^ppo\.gamma = much: needs a number$"),
-    (["--game.rule=hull"], r"game: unknown stability rule 'hull': one of hull_1, hull_alpha"),
+    (["--game.rule=hull"], r"game: unknown stability rule 'hull': needs one of hull_1, hull_alpha"),
     (["--game.rule=null"], r"game\.rule = null: needs the name of a rule"),
     (["--game.mask_orientations=null"], r"^game\.mask_orientations = null: needs true or false$"),
     (["--game.margin=-1"], r"game: margin = -1\.0: needs a number of cells ≥ 0"),

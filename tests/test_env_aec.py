@@ -525,7 +525,7 @@ def test_an_episode_that_cannot_begin_is_skipped() -> None:
 
 def test_a_first_item_without_a_legal_cell_is_refused_at_reset() -> None:
     env = env_aec.env(margin=4.0)
-    with pytest.raises(ValueError, match="may be placed nowhere"):
+    with pytest.raises(ValueError, match="no episode can begin"):
         env.reset(seed=0)
 
 

@@ -37,7 +37,7 @@ def test_a_package_that_may_not_be_written_to_is_imported_with_one_warning(tmp_p
     assert result.returncode == 0, result.stderr
     assert str(copy) in result.stdout
     assert result.stderr.count("compiled code cannot be cached") == 1
-    assert "set NUMBA_CACHE_DIR to a folder that may be written to" in result.stderr
+    assert "set NUMBA_CACHE_DIR to a writable folder" in result.stderr
 
 
 def test_a_damaged_cache_is_compiled_around(tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         ({"margin": True}, "margin = True"),
         ({"rule": "area_ratio", "margin": 1}, "no parameter 'margin'"),
         ({"thresholds": "code"}, "no parameter 'thresholds'"),
-        ({"thresholds": "codes"}, "thresholds = 'codes': one of paper, code"),
+        ({"thresholds": "codes"}, "thresholds = 'codes': needs one of paper, code"),
         ({"rule": make_rule("hull_1"), "margin": 1}, "margin: needs the name of a rule"),
         ({"mask_orientations": None}, "mask_orientations = None: needs true or false"),
         ({"max_items": 0}, "max_items = 0: needs a whole number ≥ 1"),
@@ -264,7 +264,7 @@ def test_the_equilibrium_rule_uses_the_files_weights() -> None:
         *[({"com_offset": value}, "com_offset")
           for value in ("000", None, ("0.1", 0, 0), (True, 0, 0), (0.1, 0))],
         *[({name: 10**400}, f"{name} = .*: needs a finite number") for name in ("alpha", "margin")],
-        ({"thresholds": ["code"]}, "thresholds = .*: one of paper, code"),
+        ({"thresholds": ["code"]}, "thresholds = .*: needs one of paper, code"),
         ({"items": [np.ma.array([[2, 2, 2], [9, 9, 9]], mask=[[0] * 3, [1] * 3])]},
          "items: has masked values"),
         ({"auto_reset": "no"}, "auto_reset = 'no': needs true or false"),

@@ -103,7 +103,7 @@ def _com_offset(value: Any) -> tuple[float, float, float]:
 
 def _thresholds(value: Any) -> str | None:
     if value is not None and not (isinstance(value, str) and value in THRESHOLDS):
-        raise ValueError(f"{shown(value)}: one of {', '.join(THRESHOLDS)}")
+        raise ValueError(f"{shown(value)}: needs one of {', '.join(THRESHOLDS)}")
     return None if value is None else str(value)
 
 

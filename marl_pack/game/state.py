@@ -111,7 +111,7 @@ class GameState:
         middle = centres - corners[..., :2]
         balanced = (weights > 0) & weights.isfinite()
         balanced &= ((middle >= 0) & (middle <= sides[..., :2])).all(2)
-        refuse_where(real & ~balanced, "bins.loads", "a positive weight over the box's base")
+        refuse_where(real & ~balanced, "bins.loads", "a positive weight and a centre in the box")
         labels = (bins.labels >= UNKNOWN).all(2) & (bins.labels[..., 1] < len(ORIENTATIONS))
         refuse_where(real & ~labels, "bins.labels", "an item's number and an orientation")
         rebuilt = empty(len(self), bins.size, most, bins.device, bins.backend)

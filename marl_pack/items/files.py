@@ -36,7 +36,8 @@ def read_fields(path: Path) -> dict[str, Any]:
     readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
     suffix = path.suffix.lower()
     if suffix not in readers:
-        raise ValueError(f"{path}: unknown ending {path.suffix!r}: one of {', '.join(readers)}")
+        endings = ", ".join(readers)
+        raise ValueError(f"{path}: unknown ending {path.suffix!r}: needs one of {endings}")
     return readers[suffix](path)
 
 

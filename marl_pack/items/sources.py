@@ -97,7 +97,8 @@ def make_stream(
         return _generated(items, size, sides)
     if isinstance(items, str | Path):
         if isinstance(items, str) and not Path(items).suffix:
-            raise ValueError(f"unknown items {items!r}: one of {', '.join(GENERATED)}, or a file")
+            names = ", ".join(GENERATED)
+            raise ValueError(f"unknown items {items!r}: needs one of {names}, or a file")
         return load(items, size)[0]
     if isinstance(items, Items):
         attributes: dict[str, Any] = dict(items.to("cpu").tensors())
@@ -120,7 +121,7 @@ def check_stream(stream: Any) -> Stream:
     missing = [member for member in MEMBERS if not hasattr(stream, member)]
     if missing:
         raise ValueError(
-            f"{name}: needs to be an array or a stream, which also needs {', '.join(missing)}"
+            f"{name}: needs to be an array or a stream; a stream also needs {', '.join(missing)}"
         )
     for member in METHODS:
         if not callable(getattr(stream, member)):

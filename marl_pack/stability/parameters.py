@@ -43,7 +43,8 @@ def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
     """
     if isinstance(thresholds, str):
         if thresholds not in THRESHOLDS:
-            raise ValueError(f"area_ratio thresholds {thresholds!r}: one of {list(THRESHOLDS)}")
+            names = ", ".join(THRESHOLDS)
+            raise ValueError(f"area_ratio thresholds {thresholds!r}: needs one of {names}")
         return THRESHOLDS[thresholds]
     try:
         pairs = tuple(

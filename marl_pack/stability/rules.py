@@ -158,7 +158,8 @@ RULES: dict[str, Callable[..., Tensor]] = {
 def unknown_rule(name: object) -> ValueError:
     """Return the error for an unknown rule; it suggests the nearest name."""
     guess = renamed.guess(name, RULES) if isinstance(name, str) else ""
-    return ValueError(f"unknown stability rule {shown(name)}: one of {', '.join(RULES)}{guess}")
+    names = ", ".join(RULES)
+    return ValueError(f"unknown stability rule {shown(name)}: needs one of {names}{guess}")
 
 
 def make_rule(name: str, **parameters: object) -> Rule:
