@@ -288,10 +288,10 @@ class Plan:
         Raises:
             ValueError: if ``content`` is not such a dict, or has an impossible value.
         """
-        what = f"{source}: not a plan in JSON"
+        prefix = f"{source}: not a plan in JSON"
         if not isinstance(content, dict):
-            raise ValueError(f"{what}: needs an object with the keys {', '.join(KEYS)}")
-        check_names(content, KEYS, KEYS, what, "key")
+            raise ValueError(f"{prefix}: needs an object with the keys {', '.join(KEYS)}")
+        check_names(content, KEYS, KEYS, prefix, "key")
         sizes, boxes = content["bins"], content["boxes"]
         try:
             if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
@@ -309,7 +309,7 @@ class Plan:
             if content[UNIT] is not None:
                 real_number(content[UNIT], UNIT)
         except ValueError as error:
-            raise ValueError(f"{what}: {error}") from None
+            raise ValueError(f"{prefix}: {error}") from None
         try:
             return cls._of_rows(sizes, rows, content[UNIT])
         except ValueError as error:

@@ -137,10 +137,10 @@ def _load_json(path: Path) -> list[Plan]:
     if not isinstance(content["plans"], list) or not content["plans"]:
         raise ValueError(f"{path}: {NOT_PLANS}: plans needs a list of plans")
     plans = []
-    for e, each in enumerate(content["plans"]):
-        if not isinstance(each, dict) or each.get("episode") != e:
+    for e, entry in enumerate(content["plans"]):
+        if not isinstance(entry, dict) or entry.get("episode") != e:
             raise ValueError(f"{path}: plan {e}: needs an object whose episode is {e}")
-        fields = {key: value for key, value in each.items() if key != "episode"}
+        fields = {key: value for key, value in entry.items() if key != "episode"}
         plans.append(Plan.of_dict(fields, f"{path}: episode {e}"))
     return plans
 

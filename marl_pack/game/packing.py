@@ -250,9 +250,9 @@ class Packing(Copied):
             number = tensors.pop(name, expected)  # the games are played again in any case
             same = isinstance(number, Tensor) and number.dtype == expected.dtype
             if not same or not torch.equal(number.cpu(), expected):
-                what = name.removesuffix("_fingerprint")
-                changed = "; was their file changed?" if what == "items" else ""
-                raise ValueError(f"state of another game: needs the {what} of this game{changed}")
+                part = name.removesuffix("_fingerprint")
+                changed = "; was their file changed?" if part == "items" else ""
+                raise ValueError(f"state of another game: needs the {part} of this game{changed}")
         state = self.state.holding(tensors)
         self._check_origin(state)
         self.state.copy_from(state)

@@ -173,8 +173,8 @@ def _largest_levels(
         else [largest(x_part, (d, None)) for x_part in x_parts]
         + [largest((w, None), y_part) for y_part in y_parts]
     )
-    whole = torch.maximum(halves[0], halves[1]) if cover else slide(level, w, d)
-    return whole, quadrants, halves
+    windows = torch.maximum(halves[0], halves[1]) if cover else slide(level, w, d)
+    return windows, quadrants, halves
 
 
 def support_mask(

@@ -117,8 +117,7 @@ def _centre_within_hull(cells: NDArray[np.bool_], reading: Reading) -> bool:
     try:
         import cv2
     except ModuleNotFoundError as error:
-        what = "the paper's algorithms need OpenCV"
-        raise missing(error, what, "reference") from None
+        raise missing(error, "the paper's algorithms need OpenCV", "reference") from None
     if not cells.any():
         return False
     w, d = cells.shape
