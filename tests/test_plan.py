@@ -144,7 +144,7 @@ def test_json_that_is_no_plan_is_refused(text: str, why: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize(("change", "why"), [
     (lambda lines: [], "needs the columns id,bin"),
-    (lambda lines: lines[:1], "and at least one box"),
+    (lambda lines: lines[:1], "and at least one line"),
     (lambda lines: ["a,b", *lines[1:]], "needs the columns"),
     (lambda lines: [*lines[:2], "1,2"], "box 1: has 2 values, needs 16"),
     (lambda lines: [lines[0], lines[1].replace("8.0", "heavy")], "box 0: .*heavy"),

@@ -14,7 +14,7 @@ from marl_pack.config.schema import Config
 TITLE = """\
 # Every setting at its default: the settings that learn best on RS. Other files hold only what they
 # change. `make configs` writes this file from the code.
-#   python -m marl_pack.train --config default
+#   marl-pack train --config default
 """
 
 
