@@ -1,7 +1,8 @@
 """Measure the speed of the game: ``python -m benchmarks.game``.
 
-Random feasible play with the masks of all six orientations at every step, choice included: N games
-at once on every device, cost against the grid's size, and one game through the PettingZoo view.
+The games are random legal play with the masks of all six orientations at every step, including the
+random choice. Measured are N games at once on every device, the cost for several sizes of the grid,
+and one game through the PettingZoo view.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from marl_pack.game.packing import Packing
 
 
 def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> float:
-    """Return items placed per second of CPU time (on CUDA wall time): the best of ``repeats``."""
+    """Return items placed per second of CPU time (on CUDA wall time), the best of ``repeats``."""
     on_cpu = game.device.type == "cpu"
     clock = time.process_time if on_cpu else time.perf_counter
     policy = make_policy("random", 0, game.device)
@@ -39,7 +40,7 @@ def steps_per_second(game: Packing, seconds: float = 1.0, repeats: int = 5) -> f
 
 
 def batched(measured: Measurements) -> None:
-    """Keep steps per second against the number of games."""
+    """Measure steps per second for several numbers of games."""
     for device in devices():
         for n in (1, 64, 1024, 4096) if device == "cpu" else (1024, 4096, 16384, 65536):
             speed = steps_per_second(Packing(n, device=device))
@@ -47,7 +48,7 @@ def batched(measured: Measurements) -> None:
 
 
 def scaling(measured: Measurements) -> None:
-    """Keep steps per second against the grid's size; the items grow with the bin."""
+    """Measure steps per second for several sizes of the grid; the items grow with the bin."""
     for side in (10, 20, 40, 80, 160):
         n = max(4, 1024 * 100 // side**2)
         game = Packing(n, (side, side, side), sides=(side // 5, side // 2))
@@ -56,7 +57,7 @@ def scaling(measured: Measurements) -> None:
 
 
 def through_pettingzoo(measured: Measurements, seconds: float = 1.0, repeats: int = 5) -> None:
-    """Keep turns per CPU-second of one game through the AEC view, in all its wrappers."""
+    """Measure turns per CPU second of one game through the AEC view with all its wrappers."""
     env = env_aec.env()
     env.reset(seed=0)
     generator = np.random.default_rng(0)

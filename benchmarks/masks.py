@@ -1,10 +1,10 @@
 """Time the masks of the stability rules: ``python -m benchmarks.masks``.
 
-1. One mask at 120 × 120 beside the paper's Algorithm 1 as it is printed
-   (:mod:`marl_pack.stability.paper`). Timed is its cheapest reading, a point for each cell; the
-   masks are compared with the reading of marl_pack, the cells' squares.
+1. One mask at 120 × 120, compared with the paper's Algorithm 1 as it is printed
+   (:mod:`marl_pack.stability.paper`). Its cheapest reading is timed, with a point for each cell.
+   The masks are checked against the reading of marl_pack, with a square for each cell.
 2. Batched masks at 10 × 10, on every device.
-3. Cost against the grid's size.
+3. The cost for several sizes of the grid.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from marl_pack.stability.paper import convex_hull_alpha
 
 
 def against_the_literal_reading(measured: Measurements, states: int = 32) -> None:
-    """Keep figure 1: one mask, compared with the literal reading."""
+    """Measure figure 1: one mask, compared with the literal reading of the paper."""
     size, sides = LARGE
     game = in_play(states, LARGE, steps=12)
     items = random_items(states, sides)
@@ -63,7 +63,7 @@ def against_the_literal_reading(measured: Measurements, states: int = 32) -> Non
 
 
 def batched(measured: Measurements, n: int = 1024) -> None:
-    """Keep figure 2: the batched masks of every rule."""
+    """Measure figure 2: the batched masks of every rule."""
     for device in devices():
         game = in_play(n, SMALL, device=device)
         item = game.orient_item(game.items)
@@ -78,9 +78,9 @@ def batched(measured: Measurements, n: int = 1024) -> None:
 
 
 def scaling(measured: Measurements) -> None:
-    """Keep figure 3: the cost of masks against the grid.
+    """Measure figure 3: the cost of masks for several sizes of the grid.
 
-    The items grow with the bin, from its 5th to half of it.
+    The items grow with the bin: their sides are from a fifth to a half of its side.
     """
     for side in (10, 20, 40, 80, 160):
         place = ((side, side, side), (side // 5, side // 2))

@@ -1,8 +1,8 @@
-"""Keep measured figures in ``results/*.json``, each with what made it.
+"""Store measured figures in ``results/*.json``, each with a record of how it was measured.
 
-A file is a table. Each of its rows has figures and a record: the command, commit, CPU, threads,
-seeds, packages and date. What is measured again replaces its row alone, so a table may be made in
-parts, by several processes and on several machines.
+A file is a table. Each row has figures and a record: the command, commit, CPU, threads, seeds,
+packages and date. A new measurement replaces only its own row, so a table may be made in parts, by
+several processes and on several machines.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
 PACKAGES = ("torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless")
 MEASURED = ("marl_pack", "models/*.pt", "configs")
-"""What figures depend on, beside the commands themselves."""
+"""The files that figures depend on, besides the code of the commands."""
 PROGRAMS = {
     "packing": "experiments.packing --tables packing",
     "other_rules": "experiments.packing --tables other_rules",
@@ -45,8 +45,8 @@ class Results:
     """A table of results in a JSON file.
 
     Args:
-        name: of the file, without its ending.
-        folder: of the file.
+        name: name of the file without its ending.
+        folder: folder of the file.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Results:
         return self.folder / f"{self.name}.json"
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """Return the rows that have been measured, by their keys; each has ``record`` too."""
+        """Return the rows that have been measured, by their keys; each includes its ``record``."""
         if not self.path.is_file():
             return {}
         rows: dict[str, dict[str, Any]] = json.loads(self.path.read_text(encoding="utf-8"))
@@ -68,7 +68,7 @@ class Results:
         """Return one row.
 
         Raises:
-            ValueError: if it has not been measured; names the command that does.
+            ValueError: if it has not been measured; names the command that measures it.
         """
         rows = self.rows()
         if key not in rows:
@@ -76,13 +76,13 @@ class Results:
         return rows[key]
 
     def put(self, key: str, figures: Mapping[str, Any], record: Mapping[str, Any]) -> None:
-        """Write one row and keep the others, also those that another process has just written."""
+        """Write one row; rows that other processes write at the same time are not lost."""
         with self._locked():
             rows = self.rows() | {key: {**figures, "record": dict(record)}}
             write_json(self.path, dict(sorted(rows.items())))
 
     def remove(self, key: str) -> None:
-        """Forget one row."""
+        """Remove one row."""
         with self._locked():
             write_json(self.path, {k: row for k, row in self.rows().items() if k != key})
 
@@ -92,12 +92,12 @@ class Results:
 
 
 class Measurements:
-    """What one program of ``benchmarks/`` measures: each row is printed and kept.
+    """The measurements of one program of ``benchmarks/``: each row is printed and stored.
 
     Args:
-        name: of the program and of its table.
+        name: name of the program and of its table.
         description: the program's docstring.
-        seed: of all that is random in it.
+        seed: seed of everything random in the program.
     """
 
     def __init__(self, name: str, description: str, seed: int) -> None:
@@ -106,7 +106,7 @@ class Measurements:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )  # fmt: skip
         self.options.add_argument("--results", type=Path, default=RESULTS, metavar="FOLDER",
-                                  help="of the table (default: results)")  # fmt: skip
+                                  help="folder of the table (default: results)")  # fmt: skip
         self.name, self.seed = name, seed
 
     def parse(self) -> argparse.Namespace:
@@ -117,7 +117,7 @@ class Measurements:
         return chosen
 
     def keep(self, key: str, **figures: float) -> None:
-        """Print and keep the figures of one row."""
+        """Print and store the figures of one row."""
         print(f"{key}: " + ", ".join(f"{name} {value:,.6g}" for name, value in figures.items()),
               flush=True)  # fmt: skip
         self.results.put(key, figures, self.record)
@@ -129,7 +129,7 @@ def made_by(table: str) -> str:
 
 
 def reported() -> dict[str, Any]:
-    """Return the figures that other works report of themselves."""
+    """Return the figures that other works report about themselves."""
     figures: dict[str, Any] = json.loads((RESULTS / "reported.json").read_text(encoding="utf-8"))
     return figures
 
@@ -137,13 +137,13 @@ def reported() -> dict[str, Any]:
 def record(
     command: str, seeds: Sequence[int] = (), threads: int = 1, **more: Any
 ) -> dict[str, Any]:
-    """Return what a measurement was made with.
+    """Return the record of a measurement: command, commit, CPU, threads, seeds, packages and date.
 
     Args:
-        command: that measures this row.
-        seeds: of all that is random in it.
-        threads: on the CPU.
-        **more: further figures about the measurement itself.
+        command: the command that measures this row.
+        seeds: the seeds of everything random in the measurement.
+        threads: number of threads on the CPU.
+        **more: further facts about the measurement.
     """
     versions = [f"python {platform.python_version()}"]
     for name in PACKAGES:
@@ -160,9 +160,9 @@ def record(
 
 
 def commit() -> str | None:
-    """Return the last commit that changed the package, its models or configs; None outside of git.
+    """Return the last commit that changed the package, its models or configs; None without git.
 
-    Changes that are not committed add a ``+``.
+    A ``+`` at the end means that there were changes that are not committed.
     """
 
     def git(*words: str) -> str:
@@ -177,7 +177,7 @@ def commit() -> str | None:
 
 
 def cpu() -> str:
-    """Return the model of the CPU, and the widest vectors that it knows."""
+    """Return the model of the CPU and its widest vector instructions."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:

@@ -1,8 +1,8 @@
 """Time the afterstates of all legal placements: ``python -m benchmarks.room``.
 
-The bins are partly filled by random play. For every legal placement of the visible items the cells
-are counted where each of the next boxes could be placed: by sets of cells as bits (floors of up to
-128 cells), by compiled masks, and by tensor code.
+The bins are partly filled by random play. For every legal placement of the visible items, the code
+counts the cells in which each of the next boxes could be placed. Three codes are timed: sets of
+cells as bits (floors of up to 128 cells), compiled masks, and tensor code.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def seconds(
 
 
 def main() -> None:
-    """Time the afterstates of two bins."""
+    """Time the afterstates for two sizes of the bin."""
     measured = Measurements("room", __doc__, seed=1)
     measured.parse()
     torch.set_num_threads(1)

@@ -1,8 +1,9 @@
 """Compare the size of each rule's mask with the exact one: ``python -m benchmarks.rules``.
 
-Counts cells over all six orientations of the visible item, summed over all decisions of games that
-are played under ``hull_alpha``. ``unsound`` is the share of a rule's cells that exact equilibrium
-excludes. Linear programs a decision: the cells that ``hull_1`` allows and ``hull_alpha`` does not.
+The program counts cells over all six orientations of the visible item, summed over all decisions of
+games that are played under ``hull_alpha``. ``unsound`` is the share of a rule's cells that exact
+equilibrium excludes. The linear programs for a decision are the cells that ``hull_1`` allows and
+``hull_alpha`` does not.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def compare(
     n: int,
     steps: int,
 ) -> None:
-    """Keep the figures of one setting: ``n`` bins, ``steps`` decisions in each."""
+    """Measure one setting: ``n`` bins with ``steps`` decisions in each."""
     size, sides = place
     game, player = Packing(n, size, sides=sides, seed=1), make_policy(policy, 1)
     rules = {name: make_rule(name) for name in RULES}
@@ -70,8 +71,8 @@ def main() -> None:
     """Compare the rules in each setting."""
     measured = Measurements("rules", __doc__, seed=1)
     add = measured.options.add_argument
-    add("--bins", type=int, default=512, help="at 10 × 10 × 10")
-    add("--large-bins", type=int, default=24, help="at 120 × 120 × 120")
+    add("--bins", type=int, default=512, help="number of bins of 10 × 10 × 10")
+    add("--large-bins", type=int, default=24, help="number of bins of 120 × 120 × 120")
     chosen = measured.parse()
     torch.set_num_threads(1)
     compare(measured, "RS, random play", SMALL, "random", chosen.bins, 60)

@@ -1,4 +1,4 @@
-"""Games in the middle of random play under a rule, to time masks on."""
+"""Make games in the middle of random play under a rule, for timing masks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def in_play(
     steps: int = 40,
     device: str = "cpu",
 ) -> Packing:
-    """Return N games after some steps, at all stages of their episodes."""
+    """Return N games after some steps; their episodes are at different stages."""
     size, sides = place
     game = Packing(n, size, sides=sides, rule=rule, device=device, seed=1)
     player = make_policy(policy, 1, device)

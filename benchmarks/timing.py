@@ -9,10 +9,10 @@ import torch
 
 
 def best_time(work: Callable[[], object], repeats: int = 7, device: str = "cpu") -> float:
-    """Return the seconds of one call of ``work``: the least of ``repeats`` measurements.
+    """Return the seconds of one call of ``work``: the shortest of ``repeats`` measurements.
 
-    They are CPU seconds of this process on the CPU, and wall seconds, synchronised, on a CUDA
-    device. Disturbances only make a measurement longer.
+    On the CPU these are CPU seconds of this process, on a CUDA device synchronised wall seconds.
+    Disturbances only make a measurement longer.
     """
     clock = time.process_time if device == "cpu" else time.perf_counter
     calls, best = 1, float("inf")

@@ -1,9 +1,9 @@
 """Measure the speed of training: ``python -m benchmarks.training``.
 
-Measures items per second of whole PPO iterations, rollout and update (the best of several, as
-disturbances only slow them), and the share of each part: the game with its masks, networks
-(forward, backward, optimiser), rsl_rl's own code (storage, minibatches, advantages, loss), and the
-rest.
+The program measures items per second of whole PPO iterations with rollout and update (the best of
+several, as disturbances only slow them down), and the share of each part: the game with its masks,
+networks (forward, backward, optimiser), rsl_rl's own code (storage, minibatches, advantages, loss),
+and the rest.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Split:
         self.part, self.since = "rest", clock()
 
     def enter(self, part: str) -> str:
-        """Count the time from now on for ``part``, and return the part before."""
+        """Count the time from now on for ``part``; return the previous part."""
         now = self.clock()
         self.seconds[self.part] += now - self.since
         before, self.part, self.since = self.part, part, now
@@ -80,7 +80,7 @@ def watched(runner: Runner, split: Split) -> None:
 def measure(
     config_name: str, device: str, bins: int, seconds: float
 ) -> tuple[float, dict[str, float]]:
-    """Return items per second (of CPU time; on CUDA wall time) and the share of each part."""
+    """Return items per second of CPU time (on CUDA of wall time), and the share of each part."""
     config, _ = parse([
         f"--config={CONFIGS / config_name}.yaml", f"--ppo.num_envs={bins}", f"--device={device}",
         "--evaluation.every=0",
@@ -102,7 +102,7 @@ def measure(
         done += 1
         runner.train(done)
         best = max(best, items / (clock() - begun))
-    # The shares are measured separately, as measuring costs time (on CUDA it waits at every call).
+    # The shares are measured separately, as this costs time (on CUDA it waits at every call).
     split = Split(clock)
     watched(runner, split)
     backward, clip = torch.Tensor.backward, torch.nn.utils.clip_grad_norm_
@@ -124,7 +124,8 @@ def main() -> None:
     """Measure the training of each config."""
     measured = Measurements("training", __doc__, seed=0)
     add = measured.options.add_argument
-    add("--seconds", type=float, default=20.0, help="that each row takes at least (default: 20)")
+    add("--seconds", type=float, default=20.0,
+        help="shortest time of each measurement (default: 20)")  # fmt: skip
     chosen = measured.parse()
     torch.set_num_threads(1)
     for device in devices():

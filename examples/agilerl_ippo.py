@@ -1,18 +1,19 @@
 """AgileRL: IPPO for both agents, on the environment's parallel view, turn by turn.
 
-Versions: agilerl 2.58, which needs pettingzoo < 1.27 and so an environment of its own:
+Versions: agilerl 2.58, which needs pettingzoo < 1.27 and so its own virtual environment:
     pip install -e ".[agilerl]" && python examples/agilerl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 37,888 items, utilization 52.3 → 72.5 %
 
 Traps:
-- AgileRL looks for masks in `info["action_mask"]`, forgets them when it learns (its ratios then
-  compare masked with unmasked probabilities), and its `PzDummyVecEnv` shows the mask from before an
-  automatic reset. So the mask travels in the observation here, under another name (it
+- AgileRL reads masks from `info["action_mask"]` and does not use them when it learns (its ratios
+  then compare masked with unmasked probabilities). After an automatic reset its `PzDummyVecEnv`
+  still shows the old mask. So here the mask is in the observation, under another name (AgileRL
   refuses `action_mask` there), and the networks of :mod:`marl_pack.integrations.agilerl` apply it,
-  when learning too.
-- Its training loop clears `done` before it is stored when all agents end at once, so advantages
-  would run on into the next episode: the loop here is our own.
-- In the other's turn nothing is legal: constant logits, from which no gradient reaches the policy.
+  also when learning.
+- If all agents end at once, its training loop clears `done` before it is stored, so advantages
+  would continue into the next episode. So this file has its own loop.
+- In the other agent's turn nothing is legal: logits are constant, and no gradient reaches the
+  policy from there.
 """
 
 import sys
@@ -28,7 +29,7 @@ from session import Session, run
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     env = session.parallel_env()
     shown = {agent: legal_space(env.observation_space(agent)) for agent in AGENTS}
     both = IPPO(

@@ -1,15 +1,16 @@
 """BenchMARL: IPPO for both agents, through a task.
 
-Versions: benchmarl 1.5, which needs an older TorchRL, and so an environment of its own:
+Versions: benchmarl 1.5, which needs an older TorchRL, and so its own virtual environment:
     pip install -e ".[benchmarl]" && python examples/benchmarl_ippo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 29,696 items, utilization 58.9 → 71.6 %
 
 Traps:
-- BenchMARL's losses also run over the turns of the *other* agent. ``MaskedModel`` gives constant
-  logits there, so that no gradient reaches the policy; the critic learns their values.
-- BenchMARL gives all environments of a task the same seed: ``PackingTask`` counts instead.
-- Its PPO does not normalise advantages, which are small here: so is the entropy's weight.
-- A task keeps the mask from the model; here `observation_spec` shows it.
+- BenchMARL's losses also include the turns of the *other* agent. ``MaskedModel`` returns constant
+  logits there, so that no gradient reaches the policy. The critic learns the values of these turns.
+- BenchMARL gives all environments of a task the same seed: ``PackingTask`` gives each the next one.
+- Its PPO does not normalise advantages. They are small here, so the weight of the entropy is small
+  too.
+- By default a task hides the mask from the model; here `observation_spec` includes it.
 """
 
 import sys
@@ -35,14 +36,14 @@ class Counted(PackingTask):
 
 
 class Enough(KeyboardInterrupt):
-    """Ends an experiment before its time: BenchMARL closes it and lets this through."""
+    """Raised to end an experiment early: BenchMARL closes it and passes this exception on."""
 
 
 class Credit(Callback):
-    """Records in the session the rewards that BenchMARL stored for the agents."""
+    """A callback that records in the session the rewards that BenchMARL stored for the agents."""
 
     def on_batch_collected(self, batch: Any) -> None:
-        """Record the rewards of a batch; end training when there have been enough items."""
+        """Record the rewards of a batch; end training when enough items have been played."""
         for agent in AGENTS:
             current().credit(agent, batch["next", agent, "reward"].sum())
         print(f"{current().placed:,} items")
@@ -51,7 +52,7 @@ class Credit(Callback):
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     settings = ExperimentConfig.get_from_yaml()
     settings.gamma, settings.lr, settings.clip_grad_val = 1.0, 1e-3, 1.0
     settings.on_policy_collected_frames_per_batch = session.turns

@@ -1,12 +1,12 @@
 """CleanRL's style: PPO for both agents in one file, on the AEC environment as it is.
 
-Versions: needs nothing but marl_pack (and so PettingZoo and torch):
+Versions: needs only marl_pack (which includes PettingZoo and torch):
     pip install -e . && python examples/cleanrl_ppo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 110,476 items, utilization 52.3 → 74.7 %
 
-The recipe, for any trainer of one's own:
-- A turn is a sample of the agent that acted. Its reward is what it got until its next turn (or the
-  end): PettingZoo's ``env.last()`` gives just that, summed since the agent last acted.
+The recipe for any trainer of your own:
+- A turn is a sample for the agent that acted. Its reward is the sum of what the agent got until its
+  next turn (or the end). PettingZoo's ``env.last()`` returns this sum.
 - Each agent's advantages run over its own turns only.
 """
 
@@ -38,7 +38,7 @@ class Turns:
     ends: list[bool] = field(default_factory=list)  # whether it was the agent's last turn
 
     def advantages(self) -> Tensor:
-        """Compute GAE with γ = 1 over the agent's own turns; the last turn is an episode's end."""
+        """Compute GAE with γ = 1 over the agent's own turns; the last turn ends an episode."""
         advantages, after, value = [], 0.0, 0.0
         for k in reversed(range(len(self.actions))):
             if self.ends[k]:
@@ -67,7 +67,7 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
             mask = torch.from_numpy(observation["action_mask"])
             with torch.no_grad():
                 logits, value = networks[agent](planes[None], mask[None])
-            if truncated and own.actions:  # cut off, not at an end: more would have come
+            if truncated and own.actions:  # the episode was cut off: add the value of the rest
                 own.rewards[-1] += float(value)
             if terminated or truncated:
                 env.step(None)
@@ -109,7 +109,7 @@ def learn(turns: Turns, network: ActorCritic, optimizer: torch.optim.Optimizer) 
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     env = session.env()
     env.reset(seed=session.seed)
     networks = {agent: ActorCritic(agent.partition("_")[0]) for agent in AGENTS}

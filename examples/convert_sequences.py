@@ -1,8 +1,8 @@
 """Convert the sequences that Zhao et al. 2021 published to files that marl_pack reads.
 
-``python examples/convert_sequences.py dataset/rs.pt rs.npz``. Their files are lists of sequences,
-each a list of boxes [w, d, h] in cells, saved by ``torch.save``. A box as large as the bin at the
-end of a sequence is their mark of the end, and is left out.
+Usage: ``python examples/convert_sequences.py dataset/rs.pt rs.npz``. A published file has a list of
+sequences, each a list of boxes [w, d, h] in cells, saved by ``torch.save``. A box as large as the
+bin marks the end of a sequence, and is left out.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ import torch
 from numpy.typing import NDArray
 
 SCALAR = np.int64(0).__reduce__()[0]
-NUMPY_NUMBERS = [  # which a file may hold in place of Python's; the name depends on NumPy's version
+NUMPY_NUMBERS = [  # types that a file may contain; a name depends on NumPy's version
     np.dtype, type(np.dtype(np.int64)),
     (SCALAR, "numpy.core.multiarray.scalar"), (SCALAR, "numpy._core.multiarray.scalar"),
 ]  # fmt: skip
 
 
 def read(path: Path, size: Sequence[int]) -> list[NDArray[np.int64]]:
-    """Return the boxes [L, 3] of each sequence in one of their files.
+    """Return the boxes [L, 3] of each sequence in a published file.
 
     Args:
-        path: of the file.
-        size: W, D, H of the bin.
+        path: the file to read.
+        size: the bin's sides W, D, H in cells.
 
     Raises:
-        ValueError: if the file holds something else, naming the sequence.
+        ValueError: if the file contains something else; names the sequence.
     """
     try:
         with torch.serialization.safe_globals(NUMPY_NUMBERS):
             content = torch.load(path, weights_only=True)
     except OSError:
         raise
-    except Exception:  # of many kinds, with texts of many lines
+    except Exception:  # torch raises many kinds, with messages of many lines
         raise ValueError(f"{path}: needs a list of sequences, saved by torch.save") from None
     sequences = []
     for k, boxes in enumerate(content):
@@ -63,7 +63,7 @@ def write(sequences: Sequence[NDArray[np.int64]], size: Sequence[int], path: Pat
 def main() -> int:
     """Convert one file; return the exit status."""
     options = argparse.ArgumentParser(description="Convert published sequences.")
-    options.add_argument("source", type=Path, help="their file, such as dataset/rs.pt")
+    options.add_argument("source", type=Path, help="the published file, such as dataset/rs.pt")
     options.add_argument("target", type=Path, help="the file to write, such as rs.npz")
     options.add_argument(
         "--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),

@@ -10,13 +10,13 @@ ORIENTATIONS = [[0, 1, 2], [1, 0, 2], [0, 2, 1], [2, 0, 1], [1, 2, 0], [2, 1, 0]
 orient, place = (InferenceSession(f"{sys.argv[1]}/{a}.onnx") for a in ("orientation", "placement"))
 
 
-def _act(agent, item, *seen):  # its most probable action
-    inputs = zip(agent.get_inputs(), (heights, item, [H], *seen), strict=True)
+def _act(agent, item, *planes):  # the agent's most probable action
+    inputs = zip(agent.get_inputs(), (heights, item, [H], *planes), strict=True)
     return agent.run(["action"], {i.name: np.asarray(v)[None] for i, v in inputs})[0][0]
 
 
 (heights, empty), generator = np.zeros((2, W, D), int), np.random.default_rng(int(sys.argv[2]))
-for sides in generator.integers(2, 6, (200, 3))[:, ORIENTATIONS]:  # of each item, along x, y, z
+for sides in generator.integers(2, 6, (200, 3))[:, ORIENTATIONS]:  # an item's sides along x, y, z
     legal, rest, waste = np.zeros((6, W, D), bool), np.full((6, W, D), H), np.zeros((6, W, D), int)
     for o, (w, d, h) in enumerate(sides):
         for x, y in np.ndindex(W - w + 1, D - d + 1):

@@ -20,12 +20,12 @@ from session import passes, percent
 
 
 def draw(reports: Iterable[dict[str, Any]]) -> Table:
-    """Return the table, a row for each trainer."""
+    """Return a table of reports with a row for each trainer."""
     table = Table(box=box.SIMPLE)
     table.add_column("trainer", no_wrap=True)
     for title in (
         "version", "bin", "items", "minutes", "illegal\nactions", "items\nrepeat",
-        "both agents\nupdated", "rewards\nright", "utilization\nbefore", "utilization\nafter",
+        "both agents\nupdated", "rewards\ncorrect", "utilization\nbefore", "utilization\nafter",
     ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
     for report in reports:
@@ -46,12 +46,12 @@ def draw(reports: Iterable[dict[str, Any]]) -> Table:
 
 
 def main() -> int:
-    """Print the table; the exit status is 1 if a trainer does not pass, or there is none."""
+    """Print the table; return 1 if a trainer does not pass or there is no report, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="of the reports")
+    parser.add_argument("folder", type=Path, help="folder of the reports")
     files = sorted(parser.parse_args().folder.glob("*.json"))
     if not files:
-        parser.error("no report there; examples write one with --json FILE")
+        parser.error("the folder has no report; examples write one with --json FILE")
     reports = [json.loads(file.read_text()) for file in files]
     Console(width=None if sys.stdout.isatty() else 140).print(draw(reports))
     return 0 if all(map(passes, reports)) else 1

@@ -7,12 +7,12 @@ Versions: ray 2.60:
 Traps:
 - The RLModule has to apply masks: ``MaskedModule`` reads them from the observation. Connectors
   ask for values through its `ValueFunctionAPI`.
-- Ray makes the environments from a pickled function, so what it closes over is a copy. Here all
-  runs in one process (`num_env_runners=0`) and the function looks the session up.
-- A seed in `.debugging(seed=…)` would be given to *every* reset (with complete episodes), so that
-  all episodes have the same items: seed the environment once, when it is made.
-- Use `batch_mode="complete_episodes"`: a cut between the two agents' turns leaves one of them
-  without its reward.
+- Ray makes the environments from a pickled function, so an object in its closure is a copy. Here
+  everything runs in one process (`num_env_runners=0`), and the function looks up the session.
+- With complete episodes, a seed in `.debugging(seed=…)` goes to *every* reset, so all episodes have
+  the same items. Seed the environment only once, when it is made.
+- Use `batch_mode="complete_episodes"`: if an episode is cut between the two agents' turns, one of
+  them does not get its reward.
 """
 
 import sys
@@ -30,7 +30,7 @@ from session import Session, current, run
 
 
 def make_env(_: Any) -> PettingZooEnv:
-    """Return an environment whose stream has begun: the resets that follow go on in it."""
+    """Return an environment whose stream has begun; later resets continue this stream."""
     env = current().env()
     env.reset(seed=current().seed)
     return PettingZooEnv(env)
@@ -44,7 +44,7 @@ def credit(*, samples: list[Any], **_: Any) -> None:
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     register_env("packing", make_env)
     config = (
         PPOConfig()

@@ -5,9 +5,10 @@ Versions: sb3-contrib 2.9:
     Ten minutes on a busy core: 79,872 items, utilization 45.6 → 74.6 %
 
 Traps:
-- Stable-Baselines3 knows one agent and one action space: ``pad_actions=True`` gives both turns the
-  same spaces, and a fifth plane that says whose turn it is. ``Turns`` plays both.
-- The value of a state is asked for without a mask: ``MaskedPolicy`` reads it from the observation.
+- Stable-Baselines3 supports one agent and one action space. ``pad_actions=True`` gives both turns
+  the same spaces, and a fifth plane that says whose turn it is. ``Turns`` plays both agents' turns.
+- MaskablePPO asks for a state's value without a mask, so ``MaskedPolicy`` reads the mask from the
+  observation.
 """
 
 import sys
@@ -28,7 +29,7 @@ def train(session: Session) -> None:
         verbose=1, device="cpu",
     )  # fmt: skip
     session.watch(model.policy.network, model.policy.network)
-    while session.go_on():  # a call is one rollout and one update
+    while session.go_on():  # each call of learn is one rollout and one update
         model.learn(session.turns, reset_num_timesteps=False)
         for agent in AGENTS:
             session.credit(agent, model.rollout_buffer.rewards.sum())

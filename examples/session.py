@@ -1,9 +1,9 @@
-"""Command line of the examples, and the compliance report of what a trainer did.
+"""The command line of the examples, and the compliance report about a trainer.
 
-A trainer passes if it plays no illegal action, goes on to new items, changes the weights that both
-agents choose actions by, and credits both with the environment's rewards (in sum).
-:class:`Session` checks that from outside: it wraps the environment, keeps weights from before, and
-plays held-out sequences before and after.
+A trainer passes if it plays no illegal action, always gets new items, changes the weights with
+which both agents choose actions, and credits both agents with the environment's rewards (in sum).
+:class:`Session` checks that from outside: it wraps the environment, keeps a copy of the weights
+before training, and plays held-out sequences before and after.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from marl_pack.files import write_json
 from marl_pack.integrations.network import ActorCritic
 
 HELD_OUT = 10**9
-"""Seed of the sequences that are played before and after; training has smaller ones."""
+"""Seed of the sequences that are played before and after training; training has smaller seeds."""
 
 
 class Counted(BaseWrapper):
-    """The environment, with a count of what is done in it.
+    """A wrapper of the environment that counts items, illegal actions, seeds and rewards.
 
     Attributes:
-        items: items placed.
-        illegal: actions played against the mask.
-        seeded: resets with a seed, each of which begins the stream of items again.
+        items: number of items placed.
+        illegal: number of illegal actions played.
+        seeded: number of resets with a seed; each begins the stream of items again.
         totals: agent -> sum of its rewards.
     """
 
@@ -68,31 +68,33 @@ class Session:
     """One run of an example.
 
     Attributes:
-        items: how many items to train on, about.
-        turns: how many turns of both agents to play between two updates, about.
+        items: approximate number of items to train on.
+        turns: approximate number of turns of both agents between two updates.
         bin_size: W, D, H in cells.
-        seed: of weights and items.
+        seed: seed of weights and items.
 
     Args:
-        arguments: of the command line.
-        description: what ``--help`` says.
+        arguments: the words of the command line; by default those of this process.
+        description: the text of ``--help``.
     """
 
     def __init__(self, arguments: Sequence[str] | None = None, description: str = "") -> None:
         options = argparse.ArgumentParser(description=description)
         add = options.add_argument
-        add("--items", type=int, default=100_000, help="to train on (default: 100,000)")
+        add("--items", type=int, default=100_000,
+            help="number of items to train on (default: 100,000)")  # fmt: skip
         add("--turns", type=int, default=2048,
-            help="of both agents between two updates, about (default: 2048)")  # fmt: skip
-        add("--minutes", type=float, help="end after so long, even if items are left")
+            help="approximate number of turns between two updates, of both agents together "
+                 "(default: 2048)")  # fmt: skip
+        add("--minutes", type=float, help="end after this many minutes, even if items are left")
         add("--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
             help="bin size in cells (default: 10 10 10)")  # fmt: skip
         add("--sides", type=int, nargs=2, default=(2, 5), metavar=("SHORTEST", "LONGEST"),
             help="sides of the items (default: 2 5)")  # fmt: skip
         add("--episodes", type=int, default=100,
-            help="held-out sequences played before and after (default: 100)")  # fmt: skip
-        add("--seed", type=int, default=0, help="of weights and items (default: 0)")
-        add("--json", type=Path, metavar="FILE", help="write the compliance report there")
+            help="held-out sequences played before and after training (default: 100)")  # fmt: skip
+        add("--seed", type=int, default=0, help="seed of weights and items (default: 0)")
+        add("--json", type=Path, metavar="FILE", help="write the compliance report to this file")
         chosen = options.parse_args(arguments)
         self.items, self.turns, self.seed = chosen.items, chosen.turns, chosen.seed
         self.episodes = chosen.episodes
@@ -105,20 +107,20 @@ class Session:
         self.credited = dict.fromkeys(AGENTS, 0.0)
         torch.set_num_threads(1)
         torch.manual_seed(chosen.seed)
-        np.random.seed(chosen.seed)  # noqa: NPY002  # some trainers draw from there
+        np.random.seed(chosen.seed)  # noqa: NPY002  # some trainers use NumPy's global generator
 
     def env(self, **options: Any) -> Counted:
-        """Return a new AEC environment (:func:`marl_pack.env_aec.env`), counted."""
+        """Return a new AEC environment (:func:`marl_pack.env_aec.env`) with counters."""
         env = Counted(env_aec.env(bin_size=self.bin_size, sides=self.sides, **options))
         self.envs.append(env)
         return env
 
     def parallel_env(self, **options: Any) -> env_aec.Turns:
-        """Return the same, turn by turn, as :func:`marl_pack.env_aec.parallel_env` gives it."""
+        """Return a new environment in the parallel API, turn by turn, with counters."""
         return env_aec.Turns(self.env(**options))
 
     def go_on(self) -> bool:
-        """Return whether items and minutes are left to train."""
+        """Return whether items and minutes are left for training."""
         return self.placed < self.items and self.elapsed < self.minutes
 
     @property
@@ -132,7 +134,7 @@ class Session:
         return sum(env.items for env in self.envs)
 
     def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
-        """Watch the networks that will learn (twice the same, if one plays both turns).
+        """Watch the networks that will learn (the same one twice, if it plays both turns).
 
         Training begins here: its minutes are counted from now.
         """
@@ -144,7 +146,7 @@ class Session:
         self.start = time.monotonic()
 
     def _head(self, agent: str) -> torch.Tensor:
-        """Return the weights that only the agent's own choices change, not the critic."""
+        """Return the weights that only the agent's policy uses, not its critic."""
         network = self.networks[agent]
         head = network.orientations if agent == AGENTS[0] else network.cells
         return head.weight.detach().cpu().clone()
@@ -157,7 +159,7 @@ class Session:
     def play(self) -> tuple[float, float]:
         """Return the mean utilization over held-out sequences, and half its 95 % interval.
 
-        Each agent takes its most probable action. The interval is Student's.
+        Each agent takes its most probable action. The interval is by Student's t.
         """
         both = self.networks[AGENTS[0]].agent == "both"
         env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
@@ -173,15 +175,15 @@ class Session:
                 planes, mask = (torch.as_tensor(observation[k], device=network.device)[None]
                                 for k in ("observation", "action_mask"))  # fmt: skip
                 env.step(int(network(planes, mask)[0].argmax()))
-        low, high = interval(np.array(reached)) or (np.nan, np.nan)  # there are two or more
+        low, high = interval(np.array(reached)) or (np.nan, np.nan)
         return float(np.mean(reached)), (high - low) / 2
 
     def report(self, trainer: str, package: str) -> dict[str, Any]:
         """Return the compliance report.
 
         Args:
-            trainer: name that is shown.
-            package: the trainer's package, whose version is shown.
+            trainer: name of the trainer for the report.
+            package: the trainer's package, for its version.
         """
         minutes = self.elapsed
         env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
@@ -212,7 +214,7 @@ _running: list[Session] = []
 
 
 def current() -> Session:
-    """Return the session that runs, for trainers that make environments from a pickled function."""
+    """Return the running session, for trainers that make environments from a pickled function."""
     return _running[-1]
 
 
@@ -249,7 +251,7 @@ def percent(reached: tuple[float, float]) -> str:
 
 
 def passes(report: dict[str, Any]) -> bool:
-    """Return whether a report has items, no faults, and both agents updated and credited right."""
+    """Return whether a report has items, no faults, and correct updates and rewards for both."""
     return bool(
         report["items"]
         and not report["illegal"]

@@ -5,13 +5,14 @@ Versions: skrl 2.1:
     Ten minutes on a busy core: 34,816 items, utilization 52.3 → 69.6 %
 
 Traps:
-- skrl takes PettingZoo's parallel API alone. `env_aec.parallel_env()` is turn-based, so its masks
-  are exact; a conversion in which both act at once would show the placement agent a stale mask.
-- skrl knows no masks: the model has to apply them, as ``MaskedModel`` does.
-- Both agents record every turn. In the other's turn nothing is legal, so all logits are equal and
-  constant: no gradient reaches the policy from there, and the critic learns one more state's value.
-- The settings' empty dictionaries are refused (2.1): each has to name the agents.
-- The wrapper calls `state()` after each step, so the environment has to have it.
+- skrl supports only PettingZoo's parallel API. `env_aec.parallel_env()` is turn-based, so its masks
+  are exact. A conversion in which both agents act at once would show the placement agent a stale
+  mask.
+- skrl has no masks: the model has to apply them, as ``MaskedModel`` does.
+- Both agents record every turn. In the other agent's turn nothing is legal, so all logits are equal
+  and constant: no gradient reaches the policy from there. The critic learns the value of that turn.
+- skrl 2.1 refuses empty dictionaries in its settings: each has to name the agents.
+- The wrapper calls `state()` after each step, so the environment needs this method.
 """
 
 import sys
@@ -29,7 +30,7 @@ from session import Session, run
 
 
 class Credited(IPPO):
-    """Records in the session the rewards that skrl stores for the agents."""
+    """An IPPO that records in the session the rewards that skrl stores for the agents."""
 
     session: Session
 
@@ -41,9 +42,9 @@ class Credited(IPPO):
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     config.torch.device = "cpu"
-    config.torch.key = session.seed  # of the items: the wrapper's first reset takes it
+    config.torch.key = session.seed  # seed of the items, which the wrapper's first reset uses
     env = wrap_env(session.parallel_env(), wrapper="pettingzoo")
     spaces = {
         agent: {

@@ -5,13 +5,13 @@ Versions: tianshou 2.0:
     Ten minutes on a busy core: 85,587 items, utilization 49.5 → 74.8 %
 
 Traps:
-- Its PettingZoo wrapper wants one space for all agents: `pad_actions=True`.
-- Its multi-agent PPO takes every turn as a step of its own (its issue 399): the reward of a
-  placement, which both agents get, would go to the placement agent alone, the orientation agent
-  would see nothing but zeros and no end of an episode, and both would be valued by what the *other*
-  one sees next. ``OwnTurns`` gives each agent its own turns in a row instead.
-- The collector has to play whole episodes, so that every turn has what followed, and the buffer to
-  hold them all: what no longer fits would be overwritten from the front.
+- Its PettingZoo wrapper needs one space for all agents: `pad_actions=True`.
+- Its multi-agent PPO treats every turn as a step (Tianshou's issue 399). Then the reward of a
+  placement, which both agents get, goes only to the placement agent. The orientation agent gets
+  zeros and no end of an episode. The next state of both is what the *other* agent sees next. So
+  ``OwnTurns`` gives each agent only its own turns.
+- The collector has to play whole episodes, so that every turn has its next turn. The buffer has to
+  hold all of them: if it is full, its first turns are overwritten.
 """
 
 import logging
@@ -34,7 +34,7 @@ BINS, EPOCHS, MINIBATCH, RATE = 8, 4, 128, 1e-3
 
 
 class Credited(OwnTurns):
-    """Records in the session the rewards that the agents learn from."""
+    """An algorithm that records in the session the rewards from which the agents learn."""
 
     def __init__(self, session: Session, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -48,8 +48,8 @@ class Credited(OwnTurns):
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
-    logging.getLogger("tianshou").setLevel(logging.ERROR)  # it warns of rewards for two agents
+    """Train both agents until the session ends."""
+    logging.getLogger("tianshou").setLevel(logging.ERROR)  # it warns about rewards for two agents
     games = DummyVectorEnv([lambda: PettingZooEnv(session.env(pad_actions=True))] * BINS)
     games.seed([session.seed * BINS + k for k in range(BINS)])
     shown = PettingZooEnv(session.env(pad_actions=True))
@@ -65,7 +65,7 @@ def train(session: Session) -> None:
     both = Credited(session, algorithms=learners, env=shown)
     session.watch(*networks.values())
     width, depth, height = session.bin_size
-    most = 2 * width * depth * height // min(session.sides) ** 3  # turns of an episode
+    most = 2 * width * depth * height // min(session.sides) ** 3  # largest number of turns
     buffer = VectorReplayBuffer(BINS * (session.turns + most), BINS)
     collector = Collector(both, games, buffer)
     collector.reset()

@@ -1,14 +1,14 @@
 """TorchRL: PPO for both agents, on the AEC environment as it is.
 
-Versions: torchrl 0.14, which needs tensordict < 0.15 and so an environment of its own:
+Versions: torchrl 0.14, which needs tensordict < 0.15 and so its own virtual environment:
     pip install -e ".[torchrl]" && python examples/torchrl_ppo.py --items 1000000 --minutes 10
     Ten minutes on a busy core: 25,600 items, utilization 58.9 → 69.7 %
 
 Traps:
-- In the other's turn TorchRL's mask is full. ``Part`` takes it as empty, so that logits are
-  constant and no gradient reaches the policy from that turn; the critic learns its value.
+- In the other agent's turn TorchRL's mask is full. ``Part`` replaces it by an empty mask, so that
+  logits are constant and no gradient reaches the policy. The critic learns the value of that turn.
 - GAE runs over all turns, so the critic has to be trained on all of them too.
-- `PettingZooWrapper(use_mask=True)` makes each agent of an AEC environment a group of its own.
+- `PettingZooWrapper(use_mask=True)` makes a separate group of each agent of an AEC environment.
 """
 
 import sys
@@ -28,11 +28,11 @@ from marl_pack.integrations.network import ActorCritic
 from marl_pack.integrations.torchrl import Part
 from session import Session, run
 
-EPOCHS, MINIBATCH, RATE = 4, 256, 1e-3  # in every second turn an agent acts
+EPOCHS, MINIBATCH, RATE = 4, 256, 1e-3  # an agent acts in every second turn
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session has its items."""
+    """Train both agents until the session ends."""
     env = PettingZooWrapper(session.env(), use_mask=True, seed=session.seed)
     networks, actors, losses, advantages, optimizers = {}, {}, {}, {}, {}
     for agent in AGENTS:

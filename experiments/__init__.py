@@ -1,6 +1,6 @@
 """Experiments on packing and learning; each module is a command: ``python -m experiments.packing``.
 
-Each keeps its figures in ``results/``, goes on where it was stopped, and measures only what is not
-there yet; ``--only`` chooses rows, ``--again`` measures them once more. ``python -m
-experiments.page`` makes docs/results.md of them.
+Each stores its figures in ``results/``, continues where it was stopped, and measures only rows
+that are missing; ``--only`` chooses rows, ``--again`` measures them again. ``python -m
+experiments.page`` makes docs/results.md from the figures.
 """

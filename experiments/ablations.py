@@ -1,8 +1,8 @@
-"""Train with one thing changed, with three seeds each: ``python -m experiments.ablations``.
+"""Train with one setting changed, with three seeds each: ``python -m experiments.ablations``.
 
-Every run is short, 80 iterations of 1,024 items with the schedules of learning rate and entropy
-ending there, and is evaluated once, at its end, on 2,000 held-out sequences, the same for all. Runs
-stand in ``--folder`` and are resumed.
+Every run is short: 80 iterations of 1,024 items, and the schedules of learning rate and entropy end
+there. At its end the run is evaluated once on 2,000 held-out sequences, the same for all runs. Runs
+are stored in ``--folder`` and can be resumed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from marl_pack import train as training
 from marl_pack.config import parse
 
 BASE = "--config default"
-"""Options of the settings that every change is made to."""
+"""Options for the settings to which every change is applied."""
 SHORT = "--ppo.max_iterations 80 --evaluation.every 80 --evaluation.episodes 2000"
 SEEDS = (0, 1, 2)
 
@@ -53,7 +53,7 @@ CHANGES = {
     "no_orientation_mask": "--game.mask_orientations false "
     + both("planes=[resting_height,waste,grounded]"),
 }
-"""What is changed, in the order of importance."""
+"""The options of each change, by its name; the most important changes come first."""
 WORDS = {
     "none": "none",
     "no_afterstate_value": "without the plane `afterstate_value`",
@@ -71,7 +71,7 @@ WORDS = {
     "hull_1": "masks by `hull_1`",
     "no_orientation_mask": "orientations not masked, nor shown",
 }
-"""What the changes are called on the page."""
+"""The text for each change on the page of results."""
 
 
 def key_of(change: str, seed: int) -> str:
@@ -80,7 +80,7 @@ def key_of(change: str, seed: int) -> str:
 
 
 def train(change: str, seed: int, folder: Path) -> tuple[Path, list[str]]:
-    """Train one run to its end, unless it has got there; return its folder and options.
+    """Train one run to its end, unless that is done; return its folder and options.
 
     Raises:
         ValueError: if the run in that folder has other settings, or the training failed.
@@ -106,9 +106,10 @@ def main() -> int:
     """Train the runs that are missing; return the exit status."""
     rows = Rows("python -m experiments.ablations", __doc__)
     add = rows.options.add_argument
-    add("--changes", nargs="+", choices=CHANGES, default=list(CHANGES), help="(default: all)")
-    add("--seeds", nargs="+", type=int, default=SEEDS, help="(default: 0 1 2)")
-    add("--folder", type=Path, default=Path("runs/ablations"), help="of the runs")
+    add("--changes", nargs="+", choices=CHANGES, default=list(CHANGES),
+        help="changes to train with (default: all)")  # fmt: skip
+    add("--seeds", nargs="+", type=int, default=SEEDS, help="seeds of each (default: 0 1 2)")
+    add("--folder", type=Path, default=Path("runs/ablations"), help="folder of the runs")
     chosen = rows.parse()
     results = rows.results("ablations")
     keys = {key_of(change, seed): (change, seed)

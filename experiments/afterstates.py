@@ -1,8 +1,8 @@
 """Compare agents with their critic of afterstates alone: ``python -m experiments.afterstates``.
 
-Plays the same generated sequences, of the items that each checkpoint was trained on, once with its
-agents and once greedily, always taking the placement with the highest value. The gain is taken
-episode by episode.
+The program plays the same generated sequences twice, with items as in the checkpoint's training:
+once with its agents, and once greedily, always with the placement of highest value. The gain is
+computed for each episode.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ def main() -> int:
     """Play with each checkpoint that is missing; return the exit status."""
     rows = Rows("python -m experiments.afterstates", __doc__)
     add = rows.options.add_argument
-    add("checkpoints", nargs="*", default=MODELS, help="(default: those of models/)")
-    add("--episodes", type=int, default=1000, help="(default: 1000)")
-    add("--seed", type=int, default=5, help="of the sequences (default: 5)")
+    add("checkpoints", nargs="*", default=MODELS,
+        help=f"checkpoints to compare (default: {' '.join(MODELS)})")  # fmt: skip
+    add("--episodes", type=int, default=1000, help="number of sequences (default: 1000)")
+    add("--seed", type=int, default=5, help="seed of the sequences (default: 5)")
     chosen = rows.parse()
     torch.set_num_threads(1)
     results = rows.results("afterstates")

@@ -1,8 +1,9 @@
 """Draw utilization against items and time of learning: ``python -m experiments.learning_curve``.
 
-Reads the evaluations of runs (a run's folder, or a file such as models/ has) and draws two panels,
-a line a run with its 95 % interval. Keeps when each run was clearly above other policies, and its
-end. Without runs, it draws both pictures of the docs.
+The program reads the evaluations of runs (a run's folder, or a file such as models/rs.csv). It
+draws two panels, with a line and its 95 % interval for each run. Without runs, it draws both
+pictures of the docs, and stores each run's first, best and last evaluation, and when ``rs`` was
+clearly above other policies.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ OTHERS = ("cut_1_first", "cut_1_second", "cut_1_third", "cut_1_fourth", "cut_1",
           "cut_2_second", "cut_2", "types125")  # fmt: skip
 
 CPUS = {"types125": "AMD EPYC", "plain": "AMD EPYC"}
-"""Where runs were trained that were not trained on the usual machine."""
+"""The CPU of each run that was not trained on ``CPU``."""
 CPU = "Intel Xeon with AVX-512"
 
 
@@ -42,10 +43,10 @@ def name_of(run: Path) -> str:
 
 
 def levels() -> dict[str, float]:
-    """Return the utilization of others on the published RS sequences, in per cent.
+    """Return the utilization of other policies on the published RS sequences, in per cent.
 
     Raises:
-        ValueError: naming the command, if one has not been measured.
+        ValueError: if a policy has not been measured; names the command.
     """
     results = Results("packing")
     ours = {
@@ -56,7 +57,7 @@ def levels() -> dict[str, float]:
 
 
 def draw(runs: Iterable[Path], path: Path, others: Mapping[str, float]) -> None:
-    """Draw two panels, over items and over minutes, a line a run with its 95 % interval."""
+    """Draw a line with its 95 % interval for each run, over items and over minutes."""
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
@@ -80,7 +81,7 @@ def draw(runs: Iterable[Path], path: Path, others: Mapping[str, float]) -> None:
 
 
 def figures(run: Path, others: Mapping[str, float]) -> dict[str, Any]:
-    """Return when a run was clearly above others, its best evaluation and its last."""
+    """Return a run's first, best and last evaluation, and when it was clearly above others."""
     rows = history(run)
 
     def point(row: Any) -> dict[str, float]:
@@ -98,11 +99,11 @@ def figures(run: Path, others: Mapping[str, float]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Draw the pictures and keep the figures; return the exit status."""
+    """Draw the pictures and store the figures; return the exit status."""
     options = argparse.ArgumentParser(prog="python -m experiments.learning_curve")
-    options.add_argument("runs", nargs="*", type=Path, help="runs' folders, or evaluations' files")
+    options.add_argument("runs", nargs="*", type=Path, help="folders of runs, or CSV files")
     options.add_argument("--picture", type=Path, default=Path("learning_curve.png"),
-                         help="of the runs")  # fmt: skip
+                         help="picture of the runs")  # fmt: skip
     chosen = options.parse_args()
     if chosen.runs:
         draw(chosen.runs, chosen.picture, {})

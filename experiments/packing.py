@@ -1,9 +1,9 @@
 """Measure how well policies pack: ``python -m experiments.packing``.
 
-Three tables: ``packing``, policies on four sets of items; ``other_rules``, heuristics under every
-stability rule; ``bodies``, what falls in physics where a rule's assumptions do not hold. A row is
-a command of ``marl_pack.evaluate``. With ``--physics`` the packings are judged too, which takes
-most of the time; the table ``bodies`` is always judged.
+There are three tables: ``packing`` has policies on four sets of items; ``other_rules`` has
+heuristics under every stability rule; ``bodies`` shows what falls in physics if a rule's
+assumptions do not hold. Each row is one command ``evaluate``. With ``--physics`` the packings are
+judged too, which takes most of the time; the packings of ``bodies`` are always judged.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ TABLES = {
 KEPT = ROOT / "runs" / "packing"
 """The folder of the plans that are still to be judged."""
 PART = 50
-"""How many packings are judged before the figures are written."""
+"""Number of packings that are judged before the figures are written again."""
 
 
 def measure(
@@ -78,9 +78,9 @@ def measure(
 
     Args:
         results: the table.
-        key: options of ``marl_pack.evaluate``, without ``--physics``.
-        physics: whether to judge.
-        processes: that judge at once.
+        key: the row's options of the command ``evaluate``, without ``--physics``.
+        physics: whether to judge the packings.
+        processes: number of processes that judge at once.
         kept: folder of the plans that are still to be judged.
     """
     console = make_console()
@@ -126,8 +126,8 @@ def packed(setup: Setup, episodes: int, bar: Progress) -> tuple[dict[str, Any], 
         balanced[e] = strict_equilibrium(plan)
         bar.advance(solving)
     figures = summary(rollout, balanced)
-    figures["cpu_seconds"] = seconds  # of the game and the policy, loading code included
-    del figures["decisions_per_second"]  # by the clock
+    figures["cpu_seconds"] = seconds  # for the game and the policy, including loading code
+    del figures["decisions_per_second"]  # wall time, which other work on the machine changes
     return figures, rollout.plans
 
 
@@ -137,7 +137,7 @@ def judged(row: dict[str, Any]) -> bool:
 
 
 def joined(row: dict[str, Any], verdicts: dict[str, Any]) -> dict[str, Any]:
-    """Return a row with the verdicts on more of its packings."""
+    """Return a row to which the verdicts on more of its packings are added."""
     counts = ("falls", "no_verdict", "judged_episodes", "judged")
     sums = {name: row.get(name, 0) + verdicts[name] for name in counts}
     seconds = sum(r.get("judged", 0) * r.get("judge_seconds", 0) for r in (row, verdicts))
@@ -145,12 +145,14 @@ def joined(row: dict[str, Any], verdicts: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Measure what is missing of the chosen tables; return the exit status."""
+    """Measure the missing rows of the chosen tables; return the exit status."""
     rows = Rows("python -m experiments.packing", __doc__)
     add = rows.options.add_argument
-    add("--tables", nargs="+", choices=TABLES, default=list(TABLES), help="(default: all)")
+    add("--tables", nargs="+", choices=TABLES, default=list(TABLES),
+        help="tables to measure (default: all)")  # fmt: skip
     add("--physics", action="store_true", help="judge the packings of every table")
-    add("--processes", type=int, default=1, help="that judge at once (default: 1)")
+    add("--processes", type=int, default=1,
+        help="number of processes that judge at once (default: 1)")  # fmt: skip
     chosen = rows.parse()
     for table in chosen.tables:
         results, physics = rows.results(table), chosen.physics or table == "bodies"

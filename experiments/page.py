@@ -1,8 +1,8 @@
-"""Make docs/results.md and the README's table of the figures in results/.
+"""Make docs/results.md and the README's table from the figures in results/.
 
 ``python -m experiments.page`` writes them.
 
-The page's text stands in ``experiments/results.md.jinja``, its figures in the JSON files that the
+The page's text is in ``experiments/results.md.jinja``. Its figures are in the JSON files that the
 programs of ``experiments/`` and ``benchmarks/`` write.
 """
 
@@ -37,14 +37,14 @@ POLICIES = {
     "plain": "`plain`, trained on RS, without the planes `feasible_*` and `afterstate_value`",
     **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
 }
-"""What the rows of the first table are called."""
+"""The names of the rows of the first table."""
 
 
 def render(folder: Path = RESULTS) -> str:
-    """Return the page.
+    """Return the text of docs/results.md.
 
     Args:
-        folder: of the JSON files.
+        folder: the folder of the JSON files.
 
     Raises:
         ValueError: if figures are missing; names the commands that measure them.
@@ -109,7 +109,7 @@ def grouped(number: float, digits: int = 0) -> str:
 
 
 def number(value: float, form: str) -> str:
-    """Return a number in a format of Python's, with a minus sign."""
+    """Return a number in one of Python's formats, with "−" as minus sign."""
     return format(value, form).replace("-", "−")
 
 
@@ -125,7 +125,7 @@ def utilization(row: Mapping[str, Any]) -> str:
 
 
 def made(table: Results) -> str:
-    """Return the command of a table, and what its rows were made with."""
+    """Return the command of a table, and the CPUs, seeds, commits and dates of its rows."""
     records = [row["record"] for row in table.rows().values()]
 
     def all_of(name: str) -> str:
@@ -163,7 +163,7 @@ def packing_table(table: Results) -> list[dict[str, Any]]:
 
 
 def judgement(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the share of packings in equilibrium, and what physics said of those judged."""
+    """Return the share of packings in equilibrium, and the counts of judged packings and falls."""
     rows = list(rows)
     packings = sum(row["episodes"] for row in rows)
     judged = sum(row.get("judged_episodes", 0) for row in rows)
@@ -179,10 +179,10 @@ def judgement(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def ablations_table(table: Results) -> list[dict[str, Any]]:
-    """Return a row for each change that all seeds have been trained with.
+    """Return a row for each change with which all seeds have been trained.
 
     Raises:
-        ValueError: unless there are runs without a change, which the others are compared with.
+        ValueError: if there are no runs without a change, with which the others are compared.
     """
     rows = table.rows()
     lines: list[dict[str, Any]] = []
@@ -206,7 +206,7 @@ def ablations_table(table: Results) -> list[dict[str, Any]]:
 
 
 def controls_report(table: Results) -> dict[str, Any]:
-    """Return how many controls were judged right, and where verdicts flip."""
+    """Return how many controls were judged correctly, and where verdicts flip."""
     report = table.row(physics.CONTROLS)
     outcomes = report["controls"]
     right = {of: sum(o[of] == o["known"] for o in outcomes)
@@ -219,8 +219,8 @@ def readme(page: str, folder: Path = RESULTS) -> str:
     """Return README.md with its table of results.
 
     Args:
-        page: the file as it is.
-        folder: of the JSON files.
+        page: the current text of README.md.
+        folder: the folder of the JSON files.
     """
     sets = ("RS", "CUT-1")
     table = Results("packing", folder)

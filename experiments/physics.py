@@ -1,7 +1,7 @@
 """Measure the judge and the rules in physics: ``python -m experiments.physics``.
 
-Two tables: ``controls``, stacks whose fate is known by statics; ``table1``, the paper's Table 1.
-Each row of the latter is a command of ``marl_pack.sapien_check``.
+There are two tables: ``controls`` has stacks whose outcome follows from statics; ``table1`` is the
+paper's Table 1. Each row of ``table1`` is one command ``judge table1``.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ CONTROLS = "controls"
 
 
 def measured(options: list[str]) -> dict[str, Any]:
-    """Return the report of a command of ``marl_pack.sapien_check``.
+    """Run the command ``judge`` and return its report.
 
     Raises:
-        ValueError: if it failed.
+        ValueError: if the command failed.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "report.json")
@@ -43,10 +43,11 @@ def measured(options: list[str]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Measure what is missing of the chosen tables; return the exit status."""
+    """Measure the missing rows of the chosen tables; return the exit status."""
     rows = Rows("python -m experiments.physics", __doc__)
     rows.options.add_argument("tables", nargs="*", default=[CONTROLS, "table1"])
-    rows.options.add_argument("--processes", type=int, default=1, help="that judge at once")
+    rows.options.add_argument("--processes", type=int, default=1,
+                              help="number of processes that judge at once")  # fmt: skip
     chosen = rows.parse()
     results = rows.results(CONTROLS)
     for key in rows.missing(results, [CONTROLS] * (CONTROLS in chosen.tables)):

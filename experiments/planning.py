@@ -1,9 +1,9 @@
 """Measure what planning gains and costs: ``python -m experiments.planning``.
 
-Plays the same generated RS sequences with each plan. The gain over the agents without a plan is
-taken episode by episode. A decision is timed twice: on average over the many bins that are played
-at once, and for a single bin, as a robot waits for it. These are wall times: run nothing else on
-the machine.
+The program plays the same generated RS sequences with each plan. The gain over the agents without a
+plan is computed for each episode. A decision is timed twice: on average over many bins that are
+played at once, and for a single bin, as a robot waits for it. These are wall times: run nothing
+else on the machine.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def main() -> int:
     """Play with each plan that is missing; return the exit status."""
     rows = Rows("python -m experiments.planning", __doc__)
     add = rows.options.add_argument
-    add("--checkpoint", default="rs", help="(default: rs)")
+    add("--checkpoint", default="rs", help="checkpoint to play with (default: rs)")
     add("--plans", nargs="+", default=PLANS, metavar="rollouts=K,top=M,depth=D")
-    add("--episodes", type=int, default=400, help="(default: 400)")
-    add("--seed", type=int, default=5, help="of the sequences (default: 5)")
-    add("--threads", type=int, default=2, help="(default: 2)")
+    add("--episodes", type=int, default=400, help="number of sequences (default: 400)")
+    add("--seed", type=int, default=5, help="seed of the sequences (default: 5)")
+    add("--threads", type=int, default=2, help="threads on the CPU (default: 2)")
     chosen = rows.parse()
     torch.set_num_threads(chosen.threads)
     checkpoint = checkpoints.read(chosen.checkpoint)

@@ -1,4 +1,4 @@
-"""Choose and walk the rows of an experiment: what is done is kept, what is missing is measured."""
+"""Choose the rows of an experiment, and list those that are still to be measured."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Rows:
     """The rows that a command's options choose.
 
     Args:
-        program: the command.
-        description: its module's docstring.
+        program: name of the command.
+        description: the docstring of the command's module.
     """
 
     def __init__(self, program: str, description: str) -> None:
@@ -32,10 +32,10 @@ class Rows:
         )  # fmt: skip
         add = self.options.add_argument
         add("--only", nargs="+", default=[], metavar="WORD",
-            help="rows that have all these words")  # fmt: skip
-        add("--again", action="store_true", help="measure rows that are there once more")
+            help="only rows that have all these words")  # fmt: skip
+        add("--again", action="store_true", help="measure rows again that are there already")
         add("--results", type=Path, default=RESULTS, metavar="FOLDER",
-            help="of the tables (default: results)")  # fmt: skip
+            help="folder of the tables (default: results)")  # fmt: skip
         add("--list", action="store_true", help="print the rows and measure nothing")
 
     def parse(self) -> argparse.Namespace:
@@ -56,9 +56,9 @@ class Rows:
         """Yield the keys of the chosen rows that are still to be measured.
 
         Args:
-            results: the table; with ``--again`` the row is removed from it first.
-            keys: of all its rows.
-            done: whether a row that is there is complete.
+            results: the table; with ``--again`` each row is removed before it is yielded.
+            keys: the keys of all rows of the table.
+            done: a function that returns whether a row of the table is complete.
         """
         for key in keys:
             if not set(self.chosen.only) <= set(key.replace("/", " ").split()) | set(key.split()):
@@ -75,7 +75,7 @@ class Rows:
 
 
 def expanded(options: str) -> list[str]:
-    """Return options as words, with ``$MARL_PACK_DATA`` in place.
+    """Return options as words, with ``$MARL_PACK_DATA`` replaced by its value.
 
     Raises:
         ValueError: if it is not set.
@@ -86,11 +86,11 @@ def expanded(options: str) -> list[str]:
 
 
 def main_of(program: Callable[[], int]) -> int:
-    """Run a command; bad input ends it with status 2 and one line."""
+    """Run a command and return its exit status; bad input ends it with status 2 and one line."""
     try:
         return program()
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on", file=sys.stderr)
+        print("interrupted; the same command continues", file=sys.stderr)
         return 130
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(error, file=sys.stderr)

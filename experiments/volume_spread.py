@@ -1,8 +1,8 @@
 """Draw utilization against the spread of item volumes: ``python -m experiments.volume_spread``.
 
 As in the paper's figure, episodes are grouped by the standard deviation of the volumes of their
-sequence's items. The picture shows the mean utilization of each group with its 95 % interval; the
-rank correlation is that of all episodes.
+items. The picture shows the mean utilization of each group with its 95 % interval. The rank
+correlation is computed over all episodes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from marl_pack.geometry import Size
 from marl_pack.items import Stream, choose_stream
 
 mpl.use("Agg")
-from matplotlib import pyplot as plt  # once it is known that nothing is shown
+from matplotlib import pyplot as plt  # after the choice of a backend without windows
 
 POLICIES = ("rs", "max_feasible", "dblf")
 GROUPS = 8
@@ -38,9 +38,9 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
     """Return the standard deviation of the item volumes of each sequence, cells³ [E].
 
     Args:
-        stream: a file's sequences, of which all items count.
-        episodes: E.
-        seed: of the stream.
+        stream: the sequences of a file; all their items count.
+        episodes: number of sequences E.
+        seed: seed of the stream.
     """
     state = stream.start(seed, torch.arange(episodes))
     longest = stream.longest
@@ -50,7 +50,7 @@ def volume_spread(stream: Stream, episodes: int, seed: int) -> NDArray[np.float6
         items = stream.item(state, torch.full((episodes,), t))
         volumes.append(items.sides.long().prod(1))
     table = torch.stack(volumes, 1).double()
-    table[table == 0] = torch.nan  # past the end of its sequence
+    table[table == 0] = torch.nan  # after the end of the sequence
     return np.nanstd(table.numpy(), axis=1, ddof=1)
 
 
@@ -65,7 +65,7 @@ def utilization(policy: str, stream: Stream, size: Size, episodes: int) -> NDArr
 
 
 def main() -> int:
-    """Play the policies, draw the picture and keep the figures; return the exit status."""
+    """Play the policies, draw the picture and store the figures; return the exit status."""
     options = argparse.ArgumentParser(prog="python -m experiments.volume_spread")
     options.add_argument("policies", nargs="*", default=POLICIES,
                          help="checkpoints, runs' folders or heuristics")  # fmt: skip

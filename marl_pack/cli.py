@@ -21,18 +21,18 @@ COMMANDS = {
     "export": ("marl_pack.export.command", "write trained agents as ONNX, or for rsl_rl"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),
 }
-"""The module of each command, whose ``main`` runs it, and what it does."""
+"""For each command the module whose ``main`` runs it, and a description."""
 
 STATUS = """exit status:
   0    done
-  1    ended without its result: training diverged, a simulation failed, or a control
-       was judged wrongly
-  2    refused: an option, a setting or a file; the message says what would be right
-  130  interrupted; what had been written stays"""
+  1    no result: training diverged, a simulation failed, or a control was judged wrongly
+  2    refused: an option, a setting or a file is wrong; the message says what would be
+       right
+  130  interrupted; files that had been written stay"""
 
 
 def parser(program: str) -> Parser:
-    """Return the parser of the first word."""
+    """Return the parser of the first word of the command line, which names the command."""
     commands = "\n".join(f"  {name:10}{summary}" for name, (_, summary) in COMMANDS.items())
     options = Parser(
         prog=program,

@@ -1,8 +1,8 @@
 """The packing game as a two-agent PettingZoo environment (AEC).
 
-A conveyor shows one box at a time. `orientation_0` chooses how it lies, then `placement_0` places
-it in the bin, for good. Both share the reward. Masks allow exactly the actions after which the
-stack still stands (Zhou et al. 2024, Algorithms 1 and 2).
+A conveyor shows one box at a time. The agent `orientation_0` chooses one of its orientations, then
+the agent `placement_0` places it in the bin, for good. Both agents get the same reward. Masks allow
+exactly the actions after which the stack still stands (Zhou et al. 2024, Algorithms 1 and 2).
 
 | | |
 |---|---|
@@ -38,47 +38,50 @@ env.close()
 
 ## A cycle
 
-An item w × d × h arrives. The orientation agent picks one of six orientations. The placement agent
-picks the cell of the item's low corner, `x · D + y`. The item comes to rest on the highest column
-of its footprint. Then the next item arrives.
+An item w × d × h arrives. The orientation agent chooses one of six orientations. The placement
+agent chooses the cell of the item's low corner, `x · D + y`. The item comes to rest on the highest
+column of its footprint. Then the next item arrives.
 
 | orientation | 0 | 1 | 2 | 3 | 4 | 5 |
 |---|---|---|---|---|---|---|
 | sides along x, y, z | w d h | d w h | w h d | h w d | d h w | h d w |
 
-`o // 2` says which side is vertical (h, d, w). `o ^ 1` is the same rotated by 90° about the
-vertical. So `orientations=(0, 1)` keeps all items upright and `(0,)` does not rotate them. An item
-may be restricted further (`docs/items.md`): the masks then exclude its other orientations.
+For orientation o, `o // 2` says which side is vertical (h, d, w), and `o ^ 1` is o rotated by 90°
+about the vertical. So `orientations=(0, 1)` keeps all items upright, and `(0,)` does not rotate
+them. An item may be restricted further (`docs/items.md`): the masks then exclude its other
+orientations.
 
 ## Observation
 
-Four planes: the heightmap and the item's three sides, each plane of a side constant. All lengths
-are divided by the longest side of the bin. The orientation agent always sees the item's own sides
-w, d, h. The placement agent sees them along x, y, z in the chosen orientation.
+The observation has four planes: the heightmap, and one constant plane for each of the item's three
+sides. All lengths are divided by the longest side of the bin. The orientation agent always sees the
+sides w, d, h of the item as it comes. The placement agent sees the sides along x, y, z in the
+chosen orientation.
 
-`observe` of either agent and `state` work at any time, after the end too. `state()` is the
-heightmap, the item as it lies, and a plane that is 0 in the orientation agent's turn and 1 in the
-placement agent's.
+`observe(agent)` and `state()` work at any time, also after the end. `state()` has the heightmap,
+the item as it lies now, and a plane that is 0 in the orientation agent's turn and 1 in the
+placement agent's turn.
 
 ## Legal actions
 
-`observation["action_mask"]` (or `info["action_mask"]`, with `mask_in="info"`) is 1 at the legal
-actions of the agent whose turn it is and 0 everywhere for the other.
+`observation["action_mask"]` (or `info["action_mask"]`, with `mask_in="info"`) is 1 for the legal
+actions of the agent whose turn it is. It is 0 everywhere for the other agent.
 
-- A cell is legal if the item placed there is inside the bin and stands by the stability rule
+- A cell is legal if the item placed there is inside the bin and stands under the stability rule
   (`docs/stability.md`).
-- An orientation is legal if it has a legal cell. So while an agent lives, its turn has at least one
-  legal action. (With `mask_orientations=False` every orientation is; choosing one without a legal
-  cell ends the episode, with nothing placed and no reward.)
+- An orientation is legal if it has a legal cell. So until the episode ends, each turn has at least
+  one legal action. (With `mask_orientations=False` every orientation is legal; choosing one without
+  a legal cell ends the episode, with nothing placed and no reward.)
 
 An illegal action ends the game, with a reward of -1 (`illegal_reward`) for its agent and 0 for the
-other, as PettingZoo's `TerminateIllegalWrapper` does it. With `illegal="repair"` the nearest legal
+other agent, as in PettingZoo's `TerminateIllegalWrapper`. With `illegal="repair"` the nearest legal
 action is played instead.
 
 ## Reward
 
 After each placement, both agents get `alpha · w d h / (W D H) - beta · waste / (W D H)` (Eq. 5-7).
-`waste` is the empty space newly enclosed below the item. After an orientation the reward is 0.
+`waste` is the empty space that the item newly encloses below it. After an orientation the reward
+is 0.
 
 ## End of an episode
 
@@ -87,39 +90,41 @@ next item, or the bin holds `max_items` boxes. They are truncated together after
 
 ## Arguments
 
-`env()` takes arguments of its own and the options of the game. `Packing`, settings files (`game:`)
-and the commands that play have the same options; the bin's size, `bin` there, is `bin_size` here.
-An impossible value is refused in one line that says what would be right, an unknown option with the
-nearest valid name.
+`env()` takes its own arguments and the options of the game. `Packing`, settings files (`game:`) and
+the commands that play have the same options; they call the bin's size `bin`, which is `bin_size`
+here. An impossible value is refused with a message that says what would be right; for an unknown
+option the message names the nearest valid name.
 
-`env()` wraps in PettingZoo's order: `raw_env` → `TerminateIllegal` (unless repaired) →
-`AssertOutOfBounds` → `OrderEnforcing`. `raw_env()` takes all but `illegal_reward` and raises
-`ValueError` on an illegal action.
+`env()` adds PettingZoo's wrappers in the usual order: `raw_env` → `TerminateIllegal` (not with
+`illegal="repair"`) → `AssertOutOfBounds` → `OrderEnforcing`. `raw_env()` takes all arguments except
+`illegal_reward`, and raises `ValueError` on an illegal action.
 
 ## Seeds and episodes
 
-`reset(seed=s)` begins the item stream of seed s. `reset()` without a seed goes on to its next
-episode. Episode k of a seed is the same in every batch and on every device.
-`reset(options={"items": items})` plays that sequence once: an array [L, 3], or items with
-attributes. An episode whose first item has no legal action is skipped; `reset` raises if the items
-of its options begin so.
+`reset(seed=s)` begins the item stream of seed s. `reset()` without a seed begins the next episode
+of the stream. Episode k of a seed is the same in every batch and on every device.
+`reset(options={"items": items})` plays these items once: an array [L, 3], or items with attributes.
+An episode whose first item has no legal action is skipped; for items in `options`, `reset` raises
+`ValueError` instead.
 
 ## What was packed
 
-Every agent's `info` holds the numbers `utilization`, the share of the bin filled, and `packed`, the
-boxes in it. `env.unwrapped.plan` is the record of the boxes placed so far: ids, positions, sides as
-placed, orientations, weights. `plan.to_json(path)` and `plan.to_csv(path)` write it for other
-programs.
+Every agent's `info` has two numbers: `utilization`, the share of the bin that is filled, and
+`packed`, the number of boxes in it. `env.unwrapped.plan` is the record of the boxes placed so far:
+ids, positions, sides as placed, orientations, weights. `plan.to_json(path)` and
+`plan.to_csv(path)` write it for other programs.
 
 A copy (`copy.copy`, `copy.deepcopy`) or a pickle of an environment continues exactly and shares
-nothing with the original. A window stays with its owner.
+nothing with the original. A copy does not have the original's window.
 
 ## Parallel API
 
-`parallel_env()` plays one *turn* a step: the acting agent is in `infos[agent]["active_agent"]`, the
-other's action is ignored, and every mask is exact. `parallel_env(simultaneous=True)` plays one
-*item* a step: the placement agent has to choose before the orientation is known, so its mask is all
-0 and `illegal="repair"` is required. Prefer the default.
+`parallel_env()` plays one *turn* in each step: `infos[agent]["active_agent"]` names the acting
+agent, the other agent's action is ignored, and every mask is exact.
+
+`parallel_env(simultaneous=True)` plays one *item* in each step. The placement agent has to choose
+before the orientation is known, so its mask is all 0, and `illegal="repair"` is required. Prefer
+the default.
 
 ## Limits
 
@@ -129,16 +134,16 @@ other's action is ignored, and every mask is exact. `parallel_env(simultaneous=T
 | seed | 0 … 2⁶³ - 1 |
 | `max_items` | 2³¹ - 1 |
 
-Whole numbers are whole numbers: 5.0, `True` and `"5"` are refused as an action, a seed or a number
-of items. What is beyond a limit is refused before anything has changed.
+Actions, seeds and numbers of items have to be whole numbers: 5.0, `True` and `"5"` are refused. A
+value beyond a limit is refused before anything has changed.
 
 ## Version history
 
 - v0: first release (marl_pack 0.1.0)
 """
 
-# This module is a view of one game of marl_pack.game.packing.Packing; no rule of the game stands
-# here. The docstring above is the source of docs/environment.md: `make pages` writes it.
+# This module is a view of one game of marl_pack.game.packing.Packing, which has the rules of the
+# game. The docstring above is the source of docs/environment.md: `make pages` writes it.
 
 from __future__ import annotations
 
@@ -192,7 +197,7 @@ def env(*, illegal_reward: float = -1.0, **options: Unpack[Options]) -> AECEnv:
     Args:
         illegal_reward: reward of the agent that ends the game by an illegal action (only with
             ``illegal="terminate"``).
-        **options: ``bin_size``, ``items``, ``rule``, … as :class:`raw_env` describes them.
+        **options: the arguments of :class:`raw_env`: ``bin_size``, ``items``, ``rule``, …
     """
     illegal_reward = real_number(illegal_reward, "illegal_reward")
     environment: AECEnv = raw_env(**options)
@@ -207,22 +212,22 @@ def parallel_env(
 ) -> Any:
     """Return the environment in PettingZoo's parallel API.
 
-    By default one step is one turn: all agents may send actions, only that of the acting agent
-    (``infos[agent]["active_agent"]``) is played, and every mask shown is exact.
+    By default one step is one turn: all agents may send actions, only the action of the acting
+    agent (``infos[agent]["active_agent"]``) is played, and every mask is exact.
 
     With ``simultaneous=True`` one step is one item: both agents act on the same observation, so the
-    placement agent chooses before the orientation is known. Its mask would be stale: about a
-    third of the placements that it allowed would be illegal. So it is all 0, and an illegal
-    action is played as the nearest legal one. It is for code that needs every agent to act in every
-    step, and needs ``illegal="repair"``.
+    placement agent chooses before the orientation is known. Its mask would be stale: about a third
+    of the placements in it would be illegal. So its mask is all 0, and the nearest legal action is
+    played instead of an illegal one. Use this only for code in which every agent has to act in
+    every step. It needs ``illegal="repair"``.
 
     Args:
-        simultaneous: see above.
-        illegal_reward: as :func:`env` takes it.
-        **options: as :func:`env` takes them.
+        simultaneous: whether one step is one item (see above).
+        illegal_reward: the argument of :func:`env`.
+        **options: the arguments of :class:`raw_env`.
 
     Raises:
-        ValueError: if ``simultaneous`` is asked for without ``illegal="repair"``.
+        ValueError: if ``simultaneous`` is true without ``illegal="repair"``.
     """
     if truth_value(simultaneous, "simultaneous") and options.get("illegal") != "repair":
         raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
@@ -230,7 +235,7 @@ def parallel_env(
 
 
 class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
-    """PettingZoo's outermost wrapper: it names calls in a wrong order, and wrong actions."""
+    """PettingZoo's outermost wrapper: it refuses calls in a wrong order, and wrong actions."""
 
     _has_reset: bool
     _has_updated: bool
@@ -240,7 +245,7 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
         self._raw = env.unwrapped  # the wrappers' own look-ups take microseconds
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begin an episode; a refused one changes nothing."""
+        """Begin an episode; if the arguments are refused, nothing changes."""
         before = self._has_reset, self._has_updated
         try:
             super().reset(seed=seed, options=options)
@@ -252,7 +257,7 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
         """Play the selected agent's action; None once that agent has ended.
 
         Raises:
-            ValueError: for an action that is no whole number of its action space.
+            ValueError: for an action that is not a whole number in its action space.
         """
         raw = self._raw
         if self._has_reset and raw.agents:
@@ -262,7 +267,7 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
         super().step(action)
 
     def last(self, observe: bool = True) -> Any:
-        """Return what PettingZoo's ``last`` does; refuse it once no agent is left."""
+        """Return the same as PettingZoo's ``last``; raise ValueError once no agent is left."""
         _some_left(self.agents)
         return super().last(observe)
 
@@ -271,7 +276,7 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
 
 
 class AtOnce(Copied, aec_to_parallel_wrapper):
-    """PettingZoo's view of a whole item a step; a refused step changes nothing."""
+    """PettingZoo's parallel view with one item in each step; a refused step changes nothing."""
 
     def step(self, actions: dict[str, Any]) -> Any:
         """Play one action of each agent."""
@@ -280,10 +285,10 @@ class AtOnce(Copied, aec_to_parallel_wrapper):
 
 
 class Turns(Copied, turn_based_aec_to_parallel_wrapper):
-    """PettingZoo's turn-by-turn view; every info says whose turn it is, after a reset as well."""
+    """PettingZoo's parallel view with one turn in each step; every info says whose turn it is."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode, with the acting agent in every info."""
+        """Begin an episode; name the acting agent in every info."""
         return self._name_active(*super().reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> Any:
@@ -300,9 +305,10 @@ class Turns(Copied, turn_based_aec_to_parallel_wrapper):
 
 @document(" " * 8)
 class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
-    """One bin, two agents. See the module for agents, spaces, masks, reward and end.
+    """The environment without wrappers: one bin and two agents.
 
-    Copies and pickles continue exactly from the same state; a window stays with its owner.
+    The module's docstring describes agents, spaces, masks, reward and the end of an episode. Copies
+    and pickles continue exactly from the same state, without the original's window.
 
     Args:
         bin_size: (W, D, H) in cells.
@@ -311,12 +317,14 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         sides: shortest and longest side of generated items.
         max_cycles: items after which an episode is truncated; None for no limit.
         render_mode: ``"rgb_array"`` (a picture), ``"human"`` (a window) or ``"ansi"`` (text).
-        pad_actions: give both agents the same spaces: ``Discrete(max(6, W · D))``, masks filled up
-            with 0, and a fifth plane: 0 in the orientation agent's turn, 1 in the other's.
-        mask_in: ``"observation"``, or ``"info"``: then the observation is the planes alone and each
-            agent's info holds its ``action_mask``.
-        illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; raises here);
-            ``"repair"``: the nearest legal one is played and the actor's info says so.
+        pad_actions: whether both agents have the same spaces: ``Discrete(max(6, W · D))``, masks
+            padded with 0, and a fifth plane: 0 in the orientation agent's turn, 1 in the placement
+            agent's turn.
+        mask_in: ``"observation"``; or ``"info"``: then the observation has only the planes, and
+            each agent's info has its ``action_mask``.
+        illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; here it raises
+            ``ValueError``); ``"repair"``: the nearest legal action is played, and the agent's info
+            says so.
         **options: the other options of the game (``bin`` is ``bin_size`` here):
         {options}
 
@@ -362,8 +370,8 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
         self._unit = max(self._game.size)
-        self._episode = -1  # of the stream, the last one that was begun
-        self._seed: int | None = None  # of the stream, once it was begun
+        self._episode = -1  # number of the stream's last episode that was begun
+        self._seed: int | None = None  # seed of the stream; None before the first episode
         self._chosen: int | None = None
         self._read_game()
 
@@ -391,7 +399,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
 
     @property
     def game(self) -> Packing:
-        """The game that this is a view of, for players; only reset and step may change it."""
+        """The game behind this view, for policies; only ``reset`` and ``step`` may change it."""
         return self._game
 
     @property
@@ -418,20 +426,20 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         """Empty the bin and begin an episode.
 
         Args:
-            seed: begins the item stream again from this seed. Without one the stream goes on to its
-                next episode (from a random seed if none was ever given).
-            options: ``{"items": …}`` plays that sequence once, whatever the stream: an array
+            seed: seed from which the item stream begins again. Without a seed the stream continues
+                with its next episode (from a random seed if there never was one).
+            options: ``{"items": …}`` plays these items once instead of the stream's: an array
                 [L, 3], or items with attributes.
 
         Raises:
-            ValueError: for an impossible seed or items, or if no episode has a legal first item;
-                nothing has changed then.
+            ValueError: for an impossible seed or impossible items, or if no episode has a legal
+                first item; then nothing has changed.
         """
         if not isinstance(options, Mapping | None):
             raise ValueError(f"options = {shown(options)}: needs a dict")
         unknown = set(options or {}) - {"items"}
         if unknown:
-            # Not an error: PettingZoo's API test sends an option of its own.
+            # This is not an error, since PettingZoo's API test sends its own option.
             warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
         episode = self._episode if seed is None else -1
         if seed is not None:
@@ -453,7 +461,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
                 )
         else:
             game = self._stream_game
-            # An episode may be over before it begins.
+            # An episode may have no legal first item: skip it.
             game.reset(seed, first_episode=episode + 1, skip=True)
             episode = int(game.episode)
         self._seed, self._episode, self._game = seed, episode, game
@@ -473,8 +481,8 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         """Play the selected agent's action; None once that agent has ended.
 
         Raises:
-            ValueError: for an action that is no whole number of its action space, and for an
-                illegal one, unless ``illegal="repair"``.
+            ValueError: for an action that is not a whole number in its action space, and for an
+                illegal action, unless ``illegal="repair"``.
         """
         _some_left(self.agents)
         agent = self.agent_selection
@@ -488,7 +496,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             self._place(self._chosen, choice)
         elif self._masks[choice].any():
             self._chosen = choice
-        else:  # only without mask_orientations: it ends the episode with nothing placed
+        else:  # only without mask_orientations: the episode ends and nothing is placed
             self._place(choice, 0)
         self.agent_selection = self._acting
         self._accumulate_rewards()
@@ -515,7 +523,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
 
     def last(self, observe: bool = True) -> Any:
-        """Return observation, reward, ends and info of the agent that acts, as PettingZoo does.
+        """Return observation, reward, termination, truncation and info of the acting agent.
 
         Raises:
             ValueError: once no agent is left.
@@ -527,7 +535,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         """Return an agent's action as an int.
 
         Raises:
-            ValueError: unless it is a whole number of the agent's action space.
+            ValueError: unless it is a whole number in the agent's action space.
         """
         last = self._choices[agent] - 1
         if type(action) is int and 0 <= action <= last:  # the usual case
@@ -537,7 +545,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return whole_number(action, f"{agent}: action", 0, last)
 
     def _legal(self, agent: str, action: Any) -> tuple[int, bool]:
-        """Return the action to play, and whether it had to be repaired."""
+        """Return the action to play, and whether it replaces an illegal action."""
         action, mask = self.check_action(agent, action), self.action_mask(agent)
         if mask[action]:
             return action, False
@@ -551,7 +559,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return self._game.floor.nearest(action, legal), True
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all that a copy or a pickle continues from."""
+        """Return the state for a copy or a pickle: everything except the window."""
         return vars(self) | {"_window": None}
 
     # --- observations -----------------------------------------------------------------------------
@@ -572,7 +580,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return AGENTS[self._chosen is not None]
 
     def _sides(self, oriented: bool) -> NDArray[np.int16]:
-        """Return the item's sides: its own, or along x, y, z once an orientation is chosen."""
+        """Return the item's sides as it comes, or along x, y, z in the chosen orientation."""
         if oriented and self._chosen is not None:
             return self._item[list(ORIENTATIONS[self._chosen])]
         return self._item
@@ -586,7 +594,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return planes
 
     def action_mask(self, agent: str) -> NDArray[np.int8]:
-        """Return the agent's mask of legal actions, all 0 when it is not its turn."""
+        """Return the agent's mask of legal actions, all 0 if it is not the agent's turn."""
         mask = np.zeros(self.action_spaces[agent].n, np.int8)
         if agent == self._acting:
             legal = self._orientation_mask
@@ -605,7 +613,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return info
 
     def observe(self, agent: str) -> Any:
-        """Return what the agent observes now, in either agent's turn and after the end."""
+        """Return the agent's observation; this works in both agents' turns and after the end."""
         planes = self._planes(agent == PLACEMENT, self.pad_actions)
         if self.mask_in == "info":
             return planes
@@ -618,7 +626,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
     # --- rendering --------------------------------------------------------------------------------
 
     def render(self) -> NDArray[np.uint8] | str | None:
-        """Show the bin, the item to come and the cells where it may be placed.
+        """Show the bin, the visible item and the cells where it may be placed.
 
         Returns:
             uint8 [rows, columns, 3] for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
@@ -688,7 +696,7 @@ def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
 
 
 def _name_options(function: Any) -> None:
-    """Let a function's signature name every option that it hands on to :class:`raw_env`."""
+    """Add every option that a function passes on to :class:`raw_env` to its signature."""
     named = [
         parameter.replace(kind=parameter.KEYWORD_ONLY)
         for parameter in inspect.signature(raw_env).parameters.values()

@@ -1,9 +1,9 @@
 """Play policies on item sequences and print a table of their results.
 
-``python -m marl_pack.evaluate --policy dblf --items rs --episodes 1000`` prints a table: mean
-utilization with its 95 % interval, its standard deviation, items packed, decisions a second, and
-the share of episodes whose final stack is in strict static equilibrium as a whole, judged by a
-linear program that shares no code with the masks.
+``marl-pack evaluate --policy dblf --items rs --episodes 1000`` prints a table: mean utilization
+with its 95 % interval, its standard deviation, items packed, decisions a second, and the share of
+episodes whose final stack is in strict static equilibrium. A linear program that shares no code
+with the masks decides about equilibrium.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from marl_pack.players import Setup
 
 PROGRAM = "python -m marl_pack.evaluate"
-EPISODES = 1000  # of a generated stream, unless --episodes is given
+EPISODES = 1000  # default number of episodes of a generated stream
 
 
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
-    """Print the results as a table, a row for each policy.
+    """Print the results as a table with a row for each policy.
 
-    If their names are too long for the terminal, the table has numbers and the names stand below.
+    If the names are too long for the terminal, the table has numbers, and the names come below it.
     """
     console.print(title, soft_wrap=True)
     table = figures(rows, list(rows))
@@ -57,16 +57,21 @@ def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
         for number, name in zip(numbers, rows, strict=True):
             console.print(f"{number} {name}", soft_wrap=True)
     console.print(
-        f"±: 95 % interval of the mean, of {FEWEST} or more episodes;\n"
+        f"±: 95 % interval of the mean, if there are {FEWEST} or more episodes;\n"
         "dec./s: decisions (items placed) a second;\n"
-        "in equilibrium: final stacks in strict equilibrium as a whole"
+        "in equilibrium: share of final stacks in strict static equilibrium"
     )
     if any("falls" in row for row in rows.values()):
-        console.print("falls: episodes in which something fell, in physics")
+        console.print("falls: episodes in which something fell in physics")
 
 
 def figures(rows: dict[str, dict[str, Any]], names: list[str]) -> Table:
-    """Return the table of results; ``names`` are what the rows are called in it."""
+    """Return the table of results.
+
+    Args:
+        rows: the figures of each policy, by its name.
+        names: the text in the first column of each row.
+    """
     table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("policy", no_wrap=True)
     physics = any("falls" in row for row in rows.values())
@@ -88,7 +93,7 @@ def figures(rows: dict[str, dict[str, Any]], names: list[str]) -> Table:
 
 
 def falls_of(row: dict[str, Any]) -> str:
-    """Return how many episodes fell, and of how many if not all have been judged."""
+    """Return the number of episodes with a fall; adds "of N" if only N have been judged."""
     judged = row.get("judged_episodes", 0)
     return f"{row.get('falls', 0)}" + ("" if judged == row["episodes"] else f" of {judged}")
 
@@ -107,30 +112,33 @@ def parser(program: str = PROGRAM) -> Parser:
     )  # fmt: skip
     add_options(options)
     options.add_argument_group("episodes").add_argument(
-        "--episodes", type=int, help=f"how many (default: all of a file, else {EPISODES})"
-    )
+        "--episodes", type=int,
+        help=f"number of episodes (default: {EPISODES}; all sequences of a file)",
+    )  # fmt: skip
     physics = options.add_argument_group("physics")
     add = physics.add_argument
     add("--physics", action="store_true",
-        help="judge every packing in SAPIEN after each placement: the column falls")  # fmt: skip
+        help="judge every packing in SAPIEN after each placement; adds the column falls"
+        )  # fmt: skip
     add_body_options(physics)
-    add("--processes", type=int, default=1, help="that judge at once (default: 1)")
+    add("--processes", type=int, default=1,
+        help="number of processes that judge at once (default: 1)")  # fmt: skip
     add = options.add_argument_group("output").add_argument
-    add("--json", type=Path, metavar="FILE", help="write the figures there")
+    add("--json", type=Path, metavar="FILE", help="write the figures to this file")
     add(
         "--save-stacks",
         type=Path,
         metavar="FILE",
-        help="write the packed boxes of every episode there (.npz, .json or .csv)",
+        help="write the packed boxes of every episode to this file (.npz, .json or .csv)",
     )
     return options
 
 
 def check_outputs(arguments: argparse.Namespace) -> None:
-    """Refuse files that cannot be written.
+    """Refuse output files that cannot be written.
 
     Raises:
-        ValueError: naming the file.
+        ValueError: if a file cannot be written; names it.
     """
     if arguments.save_stacks is not None:
         check_ending(arguments.save_stacks, "--save-stacks")
@@ -143,7 +151,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
 
 
 def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bodies | None]:
-    """Check the options; return the number of episodes, and the bodies if physics is asked for.
+    """Check the options; return the number of episodes, and the bodies with ``--physics``.
 
     Raises:
         ValueError: if an option is impossible; says what would be right.
@@ -152,7 +160,7 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
         raise ValueError("--save-stacks: needs a single policy, as it stores one stack an episode")
     bodies = chosen_bodies(arguments) if arguments.physics else None
     if bodies is not None:
-        load_sapien()  # if it is not installed, its error comes before the games
+        load_sapien()  # fails here, before the games, if it is not installed
     elif any(getattr(arguments, key) is not None for key in BODY_OPTIONS):
         raise ValueError("--cell, --density and --com-spread go with --physics")
     whole_number(arguments.processes, "--processes", 1, MOST_AT_ONCE)
@@ -173,9 +181,9 @@ def evaluate_policy(
     bodies: Bodies | None,
     bar: Progress,
 ) -> Iterator[dict[str, Any]]:
-    """Play and judge one policy, and yield its row of figures whenever there is more of it.
+    """Play and judge one policy; yield its row of figures each time it has grown.
 
-    The packings are saved if that is asked for.
+    With ``--save-stacks`` the packings are saved.
     """
     arguments, console = setup.arguments, bar.console
     task = bar.add_task(f"{name}: episodes", total=episodes)
@@ -218,8 +226,8 @@ def evaluate_policy(
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
     """Play the policies that the options choose; return a row of figures for each.
 
-    The figures are written as they come, and what there is of them is shown at the end, also if
-    the program is stopped.
+    The figures are written while they grow. At the end they are shown, also if the program is
+    stopped early.
 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
@@ -256,7 +264,7 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
 
 
 def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
-    """Run the command ``python -m marl_pack.evaluate``; return its exit status."""
+    """Run the command ``marl-pack evaluate``; return its exit status."""
     options = parser(program)
     chosen = options.parse_args(arguments)
     try:

@@ -1,4 +1,4 @@
-"""Options of the commands that play games: who plays, and which game."""
+"""Options of the commands that play games: the policies, and the game."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from marl_pack.items.generated import no_such_file
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
 GAME_NOTE = """\
-The game is the one that the first learned policy was trained on, else RS in a bin of
-10 x 10 x 10 under hull_alpha; each option changes that. A learned policy is a published
-model, a run's folder or a checkpoint."""
+The game is the one that the first learned policy was trained on; without a learned policy
+it is RS in a bin of 10 x 10 x 10 under hull_alpha. Options of the game change this. A
+learned policy is a published model, a run's folder or a checkpoint."""
 
 
 def add_options(options: argparse.ArgumentParser) -> None:
@@ -27,20 +27,20 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add = options.add_argument_group("players").add_argument
     add("--policy", nargs="+", metavar="NAME",
         help=f"one or more of the heuristics {', '.join(POLICIES)}, of the published models "
-             f"{models}, {learned}, or a function of your own, FILE.py:NAME "
+             f"{models}, {learned}, or your own function, FILE.py:NAME "
              "(default: dblf)")  # fmt: skip
     add("--orientation", metavar="NAME",
-        help=f"with --placement: the first agent alone, of {', '.join(ORIENTATION_AGENTS)}, "
+        help=f"with --placement: the orientation agent: {', '.join(ORIENTATION_AGENTS)}, "
              f"{models}, or {learned}")  # fmt: skip
     add("--placement", metavar="NAME",
-        help=f"with --orientation: the second agent alone, of {', '.join(POLICIES)}, {models}, "
+        help=f"with --orientation: the placement agent: {', '.join(POLICIES)}, {models}, "
              f"or {learned}")  # fmt: skip
     add("--plan", metavar="rollouts=K,top=M",
         help="learned agents try their M best pairs in K imagined futures before each placement; "
              "depth=D ends each future after D items by the critic's value")  # fmt: skip
     add("--symmetric", action="store_true",
-        help="ask learned agents in all symmetries of the bin and take what is most probable on "
-             "average; with --plan which pairs to try, not in the imagined futures")  # fmt: skip
+        help="ask learned agents in all symmetries of the bin and take the action that is most "
+             "probable on average; with --plan only to choose the pairs to try")  # fmt: skip
     game = options.add_argument_group("game")
     add = game.add_argument
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
@@ -48,20 +48,20 @@ def add_options(options: argparse.ArgumentParser) -> None:
         help="sides of generated items, in cells")  # fmt: skip
     add_arguments(game)
     add("--seed", type=int, default=0,
-        help="of generated items, random play, futures of --plan and drawn bodies "
+        help="seed of generated items, random play, futures of --plan and drawn bodies "
              "(default: 0)")  # fmt: skip
     add = options.add_argument_group("computation").add_argument
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
-    add("--threads", type=int, default=1, help="on the CPU (default: 1)")
+    add("--threads", type=int, default=1, help="threads on the CPU (default: 1)")
 
 
 def check_names(arguments: argparse.Namespace) -> None:
-    """Refuse players and items that do not exist, and searches that cannot be read.
+    """Refuse policies and items that do not exist, and settings of ``--plan`` that are not valid.
 
-    What plays is slow to import, so commands call this first.
+    The code of policies is slow to import, so commands call this first.
 
     Raises:
-        ValueError, FileNotFoundError: naming what would be right.
+        ValueError, FileNotFoundError: if a name is wrong; says what would be right.
     """
     for name in arguments.policy or ():
         check_source(name, POLICIES)

@@ -1,8 +1,8 @@
 """Play one game, turn by turn, and draw the packed bin.
 
-``python -m marl_pack.play --policy rs --picture play.png`` prints each item, its orientation and
-its place, then writes a picture of the bin at the end, or with the ending ``.gif`` an animation of
-how it was packed. ``--save`` writes the plan of the bin.
+``marl-pack play --policy rs --picture play.png`` prints each item, its orientation and its
+position. Then it writes a picture of the packed bin, or, if the file ends in ``.gif``, an animation
+of how it was packed. ``--save`` writes the plan of the bin.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ def parser(program: str = PROGRAM) -> Parser:
     )
     add = options.add_argument_group("output").add_argument
     add("--picture", type=Path, default=Path("play.png"),
-        help="where to draw the packed bin (.png), or how it was packed (.gif) "
-             "(default: play.png)")  # fmt: skip
+        help="file for a picture of the packed bin (.png), or an animation of how it was packed "
+             "(.gif) (default: play.png)")  # fmt: skip
     add("--save", type=Path, metavar="FILE",
-        help="write the packed boxes there (.json, .csv or .npz)")  # fmt: skip
+        help="write the packed boxes to this file (.json, .csv or .npz)")  # fmt: skip
     return options
 
 
 def run(chosen: argparse.Namespace, console: Console) -> None:
-    """Play the game that the options choose, print its turns and draw its end.
+    """Play the game that the options choose, print its turns and draw the packed bin.
 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
@@ -85,7 +85,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
             status.update(f"playing: item {count + 1}")
             orientation, cell = policy(game)
             outcome = game.place(orientation, cell)
-            # Without a mask of orientations the choice may have no legal cell: that ends the game.
+            # Without a mask of orientations the choice may have no legal cell; this ends the game.
             placed = int(outcome.placed) > count
             axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
             table.add_row(
@@ -121,7 +121,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
 
 def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
-    """Run the command ``python -m marl_pack.play``; return its exit status."""
+    """Run the command ``marl-pack play``; return its exit status."""
     options = parser(program)
     chosen = options.parse_args(arguments)
     try:

@@ -1,7 +1,7 @@
-"""Make the players and the game that a command's options name.
+"""Make the policies and the game that a command's options name.
 
-An option of the game that is not given comes from the first checkpoint among the players. Without
-one the game is RS in a bin of 10 × 10 × 10 under ``hull_alpha``.
+If an option of the game is not used, its value comes from the first checkpoint among the policies.
+Without a checkpoint the game is RS in a bin of 10 × 10 × 10 under ``hull_alpha``.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from marl_pack.terminal import announce_compiling
 
 @dataclass(frozen=True)
 class Setup:
-    """The players and the game that a command's options name."""
+    """The policies and the game that a command's options name."""
 
-    policies: dict[str, Policy]  # by the name of each one's row
+    policies: dict[str, Policy]  # by the name of the policy's row in the table
     stream: Stream
     items: str  # a generated stream's name, or a file
-    sides: tuple[int, int]  # of generated items
+    sides: tuple[int, int]  # shortest and longest side of generated items, in cells
     spec: GameSpec
-    arguments: argparse.Namespace  # the options as they were given
+    arguments: argparse.Namespace  # the parsed options
 
     def game(self, n: int, first_episode: int) -> Packing:
-        """Return ``n`` games without ``auto_reset``, from the episode ``first_episode`` on."""
+        """Return ``n`` games without ``auto_reset``; the first plays episode ``first_episode``."""
         return Packing(
             n, items=self.stream, spec=self.spec, device=self.arguments.device,
             seed=self.arguments.seed, first_episode=first_episode, auto_reset=False,
@@ -51,7 +51,7 @@ class Setup:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All options, those of the game filled in, for a report."""
+        """All options with the values of the game filled in, for a report."""
         paths = "json", "save_stacks"
         options = {key: value for key, value in vars(self.arguments).items() if key not in paths}
         return options | self.spec.to_dict() | {"items": self.items, "sides": self.sides}
@@ -76,11 +76,11 @@ def set_threads(threads: int) -> None:
 
 
 def choose(arguments: argparse.Namespace, console: Console) -> Setup:
-    """Return the players and the game that the options name.
+    """Return the policies and the game that the options name.
 
     Args:
-        arguments: the options.
-        console: shows the game that each checkpoint was trained on.
+        arguments: the parsed options.
+        console: the console that shows the game that each checkpoint was trained on.
 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
@@ -101,11 +101,11 @@ def choose_game(
     """Return the item stream, its name, the sides of generated items, and the game.
 
     Args:
-        arguments: the options; None where one was not given.
-        learned: the game that the policies were trained on, empty if there is none.
+        arguments: the parsed options; an option that is not used is None.
+        learned: the game that the first checkpoint was trained on; empty without a checkpoint.
     """
     chosen = given_options(arguments)
-    if "rule" in chosen:  # these belong to the rule
+    if "rule" in chosen:  # margin and thresholds belong to the rule
         learned = learned | {"margin": None, "thresholds": None}
     items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
     low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
@@ -123,11 +123,11 @@ def choose_policies(
 ) -> tuple[dict[str, Policy], dict[str, Any]]:
     """Return the policies that the options name, by the name of their row, and their game.
 
-    The game is that of the first checkpoint among them (the keys of
-    :class:`marl_pack.config.Game`), empty if there is none.
+    The game is the one that the first checkpoint was trained on (the keys of
+    :class:`marl_pack.config.Game`). It is empty without a checkpoint.
 
     Raises:
-        ValueError, FileNotFoundError: if there is no policy of such a name.
+        ValueError, FileNotFoundError: if there is no policy with such a name.
     """
     pair = arguments.orientation, arguments.placement
     if (pair[0] is None) != (pair[1] is None):
@@ -163,10 +163,10 @@ def choose_policies(
 def with_search(
     policies: dict[str, Policy], arguments: argparse.Namespace, stream: Stream, size: Size
 ) -> dict[str, Policy]:
-    """Return the policies, the learned ones with the search of ``--plan``; heuristics unchanged.
+    """Return the policies, with the search of ``--plan`` added to the learned ones.
 
-    They imagine items of the stream that they were trained on; if that was a file, rows of
-    ``stream``.
+    The search imagines items of the stream that the agents were trained on. If that was a file, it
+    imagines items of ``stream``.
 
     Raises:
         ValueError: if the settings cannot be read, or there is no checkpoint to search with.

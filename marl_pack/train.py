@@ -1,8 +1,8 @@
 """Train the orientation and the placement agent.
 
-``python -m marl_pack.train --config default --seed 1`` makes a run's folder with the resolved
-settings, checkpoints, TensorBoard's logs and the history of evaluations.
-``--resume runs/NAME`` continues it. ``--help`` lists every setting.
+``marl-pack train --config default --seed 1`` makes a run's folder with all settings, checkpoints,
+TensorBoard's logs and the history of evaluations. ``--resume runs/NAME`` continues the run.
+``--help`` lists every setting.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from marl_pack.terminal import complain, make_console, make_status
 
 
 def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
-    """Run the command ``python -m marl_pack.train``; return its exit status."""
+    """Run the command ``marl-pack train``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         run, rest = _resume_option(words)
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     except (ConfigError, OSError) as error:
         complain(program, error)
         return 2
-    with make_status(make_console(), "loading what trains"):
+    with make_status(make_console(), "loading the trainer"):
         from marl_pack.training.run import start  # slow to import
 
     return start(program, words, config, run or "", rest)

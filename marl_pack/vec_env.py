@@ -14,14 +14,15 @@ from marl_pack.game.state import Copied
 
 
 class PackingVecEnv(Copied, VecEnv):
-    """G games with ``auto_reset`` behind the interface of rsl_rl's runner, one item a step.
+    """G games with ``auto_reset`` as an environment for rsl_rl's runner; one item in each step.
 
-    A step of the game has two turns. The runner sees the first one's observation; what the
-    placement agent observes depends on the orientation, so the algorithm asks the game for it.
+    A step of the game has two turns. The runner sees the observation of the first turn. The
+    observation of the placement agent depends on the orientation, so the algorithm gets it from
+    the game.
 
     Args:
         game: the games.
-        observe: the games → what the agent of the first turn observes.
+        observe: a function that returns the observation of the first turn in these games.
         cfg: the run's settings, for the logger: an object with ``to_dict``.
 
     Raises:
@@ -64,7 +65,7 @@ class PackingVecEnv(Copied, VecEnv):
 
         Returns:
             The next observation, rewards float32 [G] (Eq. 5), dones uint8 [G] and extras: ``log``
-            holds utilization and items of the episodes that have ended.
+            has the utilization and number of items of the episodes that have ended.
 
         Raises:
             ValueError: unless the actions are int64 [G, 2].

@@ -172,7 +172,7 @@ def test_reports_make_a_table(
     file.unlink()
     with pytest.raises(SystemExit):
         show_reports()
-    assert "no report there" in capsys.readouterr().err
+    assert "the folder has no report" in capsys.readouterr().err
 
 
 def test_one_episode_has_no_interval(capsys: pytest.CaptureFixture[str]) -> None:

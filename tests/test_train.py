@@ -304,7 +304,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     assert not list(run.glob(".part-*"))
     (run / "latest.pt").unlink()
     assert main(["--resume", str(run)]) == 2
-    assert f"{run}: needs latest.pt, as a run's folder has it" in capsys.readouterr().err
+    assert f"{run}: needs the folder of a run, with latest.pt" in capsys.readouterr().err
 
 
 def test_a_run_is_trained_by_one_process_and_resumed_with_its_own_record(

@@ -1,4 +1,4 @@
-"""Check settings beyond what their types can."""
+"""Check what the types of settings cannot check: ranges and combinations of values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class ConfigError(ValueError):
 
 
 class Range(NamedTuple):
-    """The numbers that a setting may be."""
+    """The range of numbers that a setting may have."""
 
     low: float
     high: float
@@ -63,7 +63,7 @@ RANGES = {
     },
     **{f"{agent}.learning_rate": Range(0, FASTEST) for agent in ("orientation", "placement")},
 }
-"""The numbers that each setting may be; those of the game and of networks check themselves."""
+"""The range of each setting; the records of the game and of networks check their own fields."""
 
 
 def refuse(key: str, value: object, right: str) -> None:
@@ -73,7 +73,7 @@ def refuse(key: str, value: object, right: str) -> None:
 
 
 def check(config: Config) -> None:
-    """Refuse settings that have the right type and are impossible.
+    """Refuse settings that have the right type but are impossible.
 
     Raises:
         ConfigError: naming the key and what would be right.
@@ -88,7 +88,7 @@ def check(config: Config) -> None:
 
 
 def check_ppo(config: Config) -> None:
-    """Refuse impossible combinations of the updates' settings."""
+    """Refuse impossible combinations of the settings under ``ppo:``."""
     ppo = config.ppo
     if 2 * ppo.num_mini_batches > ppo.num_envs * ppo.num_steps_per_env:
         refuse(
@@ -98,7 +98,7 @@ def check_ppo(config: Config) -> None:
 
 
 def check_output(config: Config) -> None:
-    """Refuse an impossible folder of the run."""
+    """Refuse an impossible name or path of the run's folder."""
     name, folder = config.output.name, config.output.folder
     if name is not None and (name in ("", ".", "..") or "/" in name or not name.isprintable()):
         refuse("output.name", name, "needs the name of one folder")
@@ -107,7 +107,7 @@ def check_output(config: Config) -> None:
 
 
 def check_agents(config: Config) -> None:
-    """Refuse impossible settings of the agents that play and learn."""
+    """Refuse impossible settings of the two agents."""
     for name, agent in (("orientation", config.orientation), ("placement", config.placement)):
         if agent.frozen and agent.policy is None:
             heuristics = POLICIES if name == "placement" else ORIENTATION_AGENTS
@@ -117,7 +117,7 @@ def check_agents(config: Config) -> None:
                 "folder or checkpoint",
             )  # fmt: skip
         if not agent.frozen and agent.policy is not None:
-            refuse(f"{name}.policy", agent.policy, f"goes with {name}.frozen: true")
+            refuse(f"{name}.policy", agent.policy, f"needs {name}.frozen: true")
         if (agent.frozen or agent.policy) and config.joint:
             refuse(f"{name}.frozen", "true", "the joint agent cannot be frozen in part")
         check_teacher(name, agent, config)
@@ -137,7 +137,7 @@ def check_teacher(name: str, agent: Agent, config: Config) -> None:
     iterations = agent.teacher_iterations
     if agent.teacher is None:
         if iterations != 0:
-            refuse(duration, iterations, f"goes with {name}.teacher")
+            refuse(duration, iterations, f"needs {name}.teacher")
         return
     if iterations not in MANY:
         refuse(duration, iterations, f"needs {MANY}")

@@ -19,12 +19,12 @@ TITLE = """\
 
 
 def default_yaml() -> str:
-    """Return ``configs/default.yaml``: the settings' defaults, and their docstrings as comments."""
+    """Return the text of ``configs/default.yaml``: each default, with its docstring as comment."""
     return "\n".join([TITLE, *_lines(Config(), "")])
 
 
 def _lines(section: Any, indent: str) -> list[str]:
-    """Return the lines of a section; one that is not indented has blank lines between its keys."""
+    """Return the lines of a section; a section without indent has blank lines between its keys."""
     documented = parse(section.__doc__ or "").params
     sentences = {part.arg_name: part.description or "" for part in documented}
     lines: list[str] = []

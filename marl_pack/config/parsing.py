@@ -23,26 +23,26 @@ from marl_pack.config.schema import Config
 from marl_pack.terminal import below_options
 
 MOST_BYTES = 100_000
-"""Largest file of settings."""
+"""Largest size of a file of settings."""
 LONGEST_VALUE = 4096
-"""Most characters of one value, as of a path."""
+"""Largest number of characters of one value, such as a path."""
 DEEPEST = 20
-"""Most levels of lists and sections in settings, far more than there are."""
+"""Largest number of levels of lists and sections in settings; real settings have far fewer."""
 NOT_DECIMAL = re.compile(r"[-+]?(0[\dxob]|\d[\d.]*[_:])")
-"""Numbers that YAML reads in another notation than the decimal one."""
+"""Numbers that YAML does not read as decimal."""
 MOST_NODES = 10_000
-"""Most values in settings, those counted that anchors repeat."""
+"""Largest number of values in settings, including those that anchors repeat."""
 
 
 YAML = "tag:yaml.org,2002:"
 NULL_TAG = f"{YAML}null"
 KEY_TAGS = (f"{YAML}str", f"{YAML}merge")
-"""Tags of the names of keys, and of ``<<``."""
+"""YAML tags of the names of keys, and of ``<<``."""
 KINDS = ("bool", "float", "int", "null", "seq", "str", "timestamp")
 VALUE_TAGS = {f"{YAML}{kind}" for kind in KINDS}
-"""Tags of values that follow from how they are written."""
+"""YAML tags that follow from how a value is written, without an explicit tag."""
 NULLS = (None, "null", "Null", "NULL", "~")
-"""What stands for no value; on the command line a text may be any of them."""
+"""Values that mean null; on the command line each may be given as text."""
 
 
 PROGRAM = "python -m marl_pack.train"
@@ -54,11 +54,11 @@ EXAMPLES = (
 
 
 class _Help(DefaultHelpFormatter, RawDescriptionHelpFormatter):
-    """A formatter that leaves the examples as they are."""
+    """A formatter of --help that does not wrap the examples."""
 
 
 def make_parser(program: str = PROGRAM) -> ArgumentParser:
-    """Return the options of ``python -m marl_pack.train``: every key of :class:`Config`."""
+    """Return the parser of the command ``train``, with every key of :class:`Config` as option."""
     parser = ArgumentParser(
         prog=program,
         usage=f"{program} [--config NAME] [--KEY VALUE ...]",
@@ -75,8 +75,8 @@ def make_parser(program: str = PROGRAM) -> ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--resume", metavar="RUN", default=None,
-        help="continue the run in this folder exactly; only output.*, evaluation.* and "
-        "ppo.max_iterations may be given beside it",
+        help="continue the run in this folder exactly; with it only output.*, evaluation.* and "
+        "ppo.max_iterations may be changed",
     )  # fmt: skip
     parser.add_class_arguments(Config, None)
     return parser
@@ -88,11 +88,11 @@ def parse(
     """Read the settings from the command line and the files that it names.
 
     Args:
-        arguments: of the command line.
-        program: the command's name, for its help.
+        arguments: the words of the command line; by default those of this process.
+        program: name of the command, for its help.
 
     Returns:
-        The checked settings, and the options before they were checked.
+        The checked settings, and the parsed options before the check.
 
     Raises:
         ConfigError: for an unknown key, a wrong type or an impossible value.
@@ -107,10 +107,10 @@ def parse(
 
 
 def _with_paths(words: Sequence[str]) -> Iterator[str]:
-    """Yield the words of a command line, with paths in place of the names of published settings.
+    """Yield the words of a command line, with the names of published settings replaced by paths.
 
     Raises:
-        ConfigError: for a name that is none of theirs.
+        ConfigError: for a name that no published settings have.
     """
     for before, word in pairwise(("", *words)):
         option, equals, value = word.partition("=")
@@ -126,12 +126,12 @@ def _with_paths(words: Sequence[str]) -> Iterator[str]:
 
 
 def is_text(source: str) -> bool:
-    """Return whether what stands for a file of settings is its text, and not its path."""
+    """Return whether a source of settings is a YAML text, and not the path of a file."""
     return "\n" in source or source.lstrip()[:1] == "{"
 
 
 def sections() -> set[str]:
-    """Return the keys that have keys of their own."""
+    """Return the names of all sections: the keys that contain other keys."""
     return {key.rpartition(".")[0] for key in TYPES} - {""}
 
 
@@ -139,8 +139,8 @@ def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[tuple[st
     """Check the values on a command line as YAML; yield the options whose values may be files.
 
     Args:
-        words: of the command line.
-        files: options whose values may be files of settings.
+        words: the words of the command line.
+        files: the options whose values may be files of settings.
 
     Raises:
         ConfigError: for a value that is too deep or too large, or a number in another notation.
@@ -151,19 +151,19 @@ def check_words(words: Sequence[str], files: Iterable[str]) -> Iterator[tuple[st
         if option.removeprefix("--") in files:
             yield option, value
         else:
-            with contextlib.suppress(yaml.YAMLError):  # a text that is no YAML
+            with contextlib.suppress(yaml.YAMLError):  # the value is a text that is not YAML
                 check_numbers(compose(value, option), option.removeprefix("--"))
 
 
 def check_source(source: str, option: str) -> None:
-    """Refuse mistakes in settings that the parser would accept or report without their line.
+    """Refuse mistakes in settings that the parser would accept, or report without the line number.
 
     Args:
-        source: the path of a YAML file, or its text.
-        option: of the command line that names it.
+        source: the path of a YAML file, or a YAML text.
+        option: the option of the command line that has this value.
 
     Raises:
-        ConfigError: for a file that is no YAML mapping, or has a key twice or an empty section.
+        ConfigError: for a file that is not a YAML mapping, or has a key twice or an empty section.
     """
     path = source
     try:
@@ -219,12 +219,12 @@ def check_source(source: str, option: str) -> None:
 
 
 def check_numbers(value: yaml.Node | None, key: str, where: str = "") -> None:
-    """Refuse numbers in quotes, and those that YAML reads as others, such as 1_0, 010 and 1:30.
+    """Refuse numbers in quotes, and numbers that YAML does not read as decimal: 1_0, 010, 1:30.
 
     Args:
-        value: of the key, or a list of values.
-        key: it may be any; those of texts are not checked.
-        where: the file and line, if it stands in a file.
+        value: the value of the key, or a list of values.
+        key: name of the key; keys whose value is a text are not checked.
+        where: the file and line, if the value comes from a file.
 
     Raises:
         ConfigError: naming the key.
@@ -245,7 +245,7 @@ def compose(text: str, name: str) -> yaml.Node | None:
     """Return the nodes of a YAML text of limited size, depth and repetition.
 
     Raises:
-        ConfigError: beyond one of the limits; names the text.
+        ConfigError: if the text is beyond one of the limits; the message has ``name``.
         yaml.YAMLError: if it is not YAML.
     """
     if len(text) > MOST_BYTES:
@@ -281,7 +281,7 @@ def compose(text: str, name: str) -> yaml.Node | None:
 
 
 def build(parser: ArgumentParser, options: Namespace) -> Config:
-    """Return the checked :class:`Config` of parsed options."""
+    """Return the :class:`Config` that parsed options describe, after checking it."""
     for key in TYPES:
         if options[key] in NULLS and not may_be_null(key):
             raise ConfigError(f"{key} = null: needs {in_words(key)}")
@@ -294,7 +294,7 @@ def build(parser: ArgumentParser, options: Namespace) -> Config:
 
 
 def from_dict(settings: dict[str, Any]) -> Config:
-    """Return the settings that a checkpoint holds.
+    """Return the settings that a checkpoint contains as a dict.
 
     Raises:
         ConfigError: if they are not settings of this version.
@@ -303,7 +303,7 @@ def from_dict(settings: dict[str, Any]) -> Config:
     with _explained(parser):
         try:
             return build(parser, parser.parse_object(settings))
-        except KeyError as error:  # a section is no mapping
+        except KeyError as error:  # a section is not a mapping
             raise ConfigError(f"settings: {error.args[0]}") from None
 
 
@@ -347,7 +347,7 @@ def may_be_null(key: str) -> bool:
 
 
 def in_words(key: str) -> str:
-    """Return what the value of a key needs to be, such as ``a number or null``."""
+    """Describe the values that a key takes, such as ``a number or null``."""
     kind = TYPES[key]
     if get_origin(kind) not in (list, tuple):
         return _in_words(kind)
@@ -366,7 +366,7 @@ def _in_words(kind: Any) -> str:
 
 
 def explain(parser: ArgumentParser, message: str) -> str:
-    """Return a message of the parser as what would be right, for an unknown key the valid ones."""
+    """Rewrite a message of the parser so that it says what would be right."""
     message = one_line(message)
     wrong = re.match(r'Parser key "([\w.]+)": ', message)
     if wrong is not None and wrong[1] in TYPES:

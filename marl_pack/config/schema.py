@@ -1,7 +1,7 @@
-"""The settings of a training run: typed, each with its meaning.
+"""The settings of a training run: each with its type, default and meaning.
 
-The docstrings are what ``python -m marl_pack.train --help`` shows; ``configs/default.yaml``
-holds every key with its default.
+``marl-pack train --help`` shows these docstrings; ``configs/default.yaml`` has every key with its
+default.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Game(GameSpec):
 
     Args:
         {options}
-        items: what the conveyor brings: rs, cut1, cut2, or a file of sequences (.npz, .json, .csv).
+        items: items on the conveyor: rs, cut1, cut2, or a file of sequences (.npz, .json, .csv).
         sides: shortest and longest side of generated items, in cells.
     """
 
@@ -30,7 +30,7 @@ class Game(GameSpec):
     sides: tuple[int, int] = DEFAULT_SIDES
 
     def __post_init__(self) -> None:
-        """Check every option, naming the section too."""
+        """Check every option; messages name the section too."""
         try:
             super().__post_init__()
         except ValueError as error:
@@ -43,14 +43,16 @@ class Agent:
 
     Args:
         frozen: whether it plays without learning.
-        policy: who plays a frozen agent: {policies}, for the orientation agent also first (as the
-            item comes), a published model such as rs, or a run's folder or checkpoint.
+        policy: the policy of a frozen agent: {policies}, for the orientation agent also first (as
+            the item comes), or a published model, a run's folder or checkpoint.
         network: shape of its network.
-        teacher: the agent whose choices it clones at first, as for policy; null for none.
-        teacher_iterations: for how many iterations it clones the teacher.
-        learning_rate: the agent's own, in place of ppo.learning_rate; null for that.
-        entropy_coef: the agent's own, in place of ppo.entropy_coef; null for that.
-        final_entropy_coef: the agent's own, in place of ppo.final_entropy_coef; null for that.
+        teacher: the policy whose choices the agent clones at first, with the same values as
+            policy; null for none.
+        teacher_iterations: number of iterations in which it clones the teacher.
+        learning_rate: the agent's own learning rate; null for ppo.learning_rate.
+        entropy_coef: the agent's own entropy bonus; null for ppo.entropy_coef.
+        final_entropy_coef: the agent's own entropy bonus at the end; null for
+            ppo.final_entropy_coef.
     """
 
     frozen: bool = False
@@ -73,25 +75,25 @@ class PPO:
     Args:
         num_envs: bins played at once (by each process).
         num_steps_per_env: items placed in each bin between two updates.
-        max_iterations: updates in all; a run sees num_envs * num_steps_per_env * max_iterations
-            items (times the number of processes).
+        max_iterations: total number of updates; a run sees num_envs * num_steps_per_env *
+            max_iterations items (times the number of processes).
         num_learning_epochs: passes over the items of one iteration.
         num_mini_batches: minibatches in each pass.
         gamma: discount of the reward, per item.
         lam: lambda of the generalised advantage estimate.
-        clip_param: largest change of an action's probability, relative, that is rewarded.
+        clip_param: largest relative change of an action's probability that is rewarded.
         value_loss_coef: weight of the critic's loss.
         use_clipped_value_loss: whether the critic's change is clipped by clip_param as well.
         entropy_coef: bonus for the entropy of the actions, at the start.
-        final_entropy_coef: that bonus at the end, linear between; null for no change.
+        final_entropy_coef: the bonus at the end, linear in between; null for no change.
         learning_rate: step size of the optimiser, at the start.
         schedule: learning rate over the run: fixed; linear, down to 0 at the end; or adaptive, by
             the KL divergence.
         desired_kl: KL divergence of an update that the adaptive schedule aims at.
-        max_grad_norm: largest norm of the gradient, of the actor's and of the critic's.
-        normalize_advantage_per_mini_batch: normalise advantages in each minibatch, not over the
-            iteration.
-        optimizer: the optimiser, one of torch's.
+        max_grad_norm: largest norm of the gradient, for the actor and for the critic.
+        normalize_advantage_per_mini_batch: whether to normalise advantages in each minibatch
+            instead of over the whole iteration.
+        optimizer: name of torch's optimiser.
     """
 
     num_envs: int = 64
@@ -119,9 +121,9 @@ class Evaluation:
     """Evaluation during training, with the most probable actions on held-out sequences.
 
     Args:
-        every: iterations between evaluations (and one at the end); 0 for none at all.
-        episodes: how many sequences.
-        seed: seed of those sequences; training draws others.
+        every: iterations between evaluations (one more at the end); 0 for no evaluations.
+        episodes: number of sequences.
+        seed: seed of these sequences; training draws others.
     """
 
     every: int = 80
@@ -134,8 +136,8 @@ class Output:
     """Where the run is stored, and how often.
 
     Args:
-        folder: where the runs' folders are made.
-        name: name of the run's folder; null for one made of the date and time.
+        folder: the folder in which each run makes its own folder.
+        name: name of the run's folder; null for a name with the date, time and seed.
         logger: where scalars go: tensorboard, or wandb (which writes TensorBoard's files as well).
         wandb_project: the project on Weights & Biases.
         latest_every: iterations between checkpoints to resume from.
@@ -156,17 +158,17 @@ class Config:
 
     Args:
         seed: seed of weights, actions and items.
-        device: where everything happens: cpu, cuda, or cuda:1; with torchrun, cuda means each
-            process's own GPU.
+        device: the device that computes everything: cpu, cuda, or cuda:1; with torchrun, cuda
+            means each process's own GPU.
         threads: threads on the CPU.
-        joint: one agent that chooses the pair (orientation, cell) in place of the two; its network
-            is placement.network.
-        init: a published model such as rs, or a run's folder or checkpoint, whose weights the
-            learning agents begin with; null for fresh ones.
+        joint: whether one agent that chooses the pair (orientation, cell) replaces the two; its
+            network is placement.network.
+        init: a published model, a run's folder or a checkpoint; the learning agents begin with its
+            weights; null for new weights.
         game: the game.
         orientation: the agent that chooses the orientation.
         placement: the agent that places the item.
-        ppo: how they learn.
+        ppo: how the agents learn.
         evaluation: evaluation during training.
         output: where the run is stored.
     """

@@ -1,7 +1,7 @@
-"""Write a checkpoint's agents for use elsewhere: ONNX, rsl_rl's own format, or to publish them.
+"""Write a checkpoint's agents as ONNX files, for rsl_rl, or as a smaller checkpoint to publish.
 
-``python -m marl_pack.export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` beside
-the checkpoint, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates.
+``marl-pack export CHECKPOINT`` writes ``orientation.onnx`` and ``placement.onnx`` into the
+checkpoint's folder, and ``afterstate_critic.onnx`` if an agent sees the values of afterstates.
 """
 
 import lazy_loader

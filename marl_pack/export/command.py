@@ -1,4 +1,4 @@
-"""The command that writes a checkpoint's agents for use elsewhere."""
+"""The command ``marl-pack export``, which writes a checkpoint's agents for other programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def parser(program: str = PROGRAM) -> Parser:
     """Return the parser of the command's options."""
     options = Parser(
         prog=program, usage=f"{program} CHECKPOINT [OPTIONS]",
-        description="Write a checkpoint's agents for use elsewhere.",
+        description="Write a checkpoint's agents for use in other programs.",
         examples=("rs --folder onnx", "runs/NAME --format rsl_rl"),
     )  # fmt: skip
     options.add_argument(
@@ -27,16 +27,16 @@ def parser(program: str = PROGRAM) -> Parser:
     )  # fmt: skip
     add = options.add_argument_group("output").add_argument
     add("--format", choices=["onnx", "rsl_rl", "checkpoint"], default="onnx",
-        help="ONNX (default), the state that a stock rsl_rl PPO loads, or a checkpoint to publish: "
-             "without what only the rest of its run needs")  # fmt: skip
+        help="ONNX (default), the state that a stock rsl_rl PPO loads, or a checkpoint to publish, "
+             "without the parts that only its run needs")  # fmt: skip
     add("--folder", type=Path,
-        help="to write to (default: beside the checkpoint; ./NAME for a published "
+        help="folder to write to (default: the checkpoint's folder; ./NAME for a published "
              "model)")  # fmt: skip
     return options
 
 
 def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
-    """Run the command ``python -m marl_pack.export``; return its exit status."""
+    """Run the command ``marl-pack export``; return its exit status."""
     options = parser(program)
     chosen = options.parse_args(arguments)
     console = make_console()

@@ -1,8 +1,8 @@
-"""Write networks as ONNX files, and agents for rsl_rl or to publish them.
+"""Write networks as ONNX files, agents for rsl_rl, and checkpoints to publish.
 
 Batch and bin size of an ONNX file are free. The masks are inputs and are applied inside: an illegal
-action has probability 0 and is never the best. Each file's metadata says what its inputs are and
-what it was trained on (``docs/onnx.md``).
+action has probability 0 and is never chosen. Each file's metadata describes its inputs and its
+training (``docs/onnx.md``).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from marl_pack.training.assembly import runner_settings
 
 OPSET = 18
 PUBLISHED = "published.pt"
-"""The file of a checkpoint to publish."""
+"""Name of the file for a checkpoint to publish."""
 
 OUTPUTS = {
     "action": Meaning(
@@ -52,14 +52,14 @@ OUTPUTS = {
     ),
     "probabilities": Meaning("0 to 1", "probability of each action; 0 where it is not legal"),
 }
-"""What the outputs of an agent's file mean, by name."""
+"""The meaning of each output of an agent's file, by name."""
 
 FEATURES_OF_AFTERSTATES = Meaning(
     "described in marl_pack.agents.afterstates.features",
     "features of the bin that each of K placements would leave",
 )
 VALUE_OF_AFTERSTATES = Meaning(
-    "reward", "the return still to come after each placement, its own reward not counted"
+    "reward", "the return still to come after each placement, without the placement's own reward"
 )
 
 
@@ -67,8 +67,8 @@ class Exported(nn.Module):
     """An actor whose inputs and outputs are plain tensors.
 
     Args:
-        actor: the agent's.
-        names: the observation's groups, in the order of the arguments.
+        actor: the agent's actor.
+        names: names of the observation's tensors, in the order of the arguments of ``forward``.
     """
 
     def __init__(self, actor: Actor, names: Sequence[str]) -> None:
@@ -86,7 +86,7 @@ class Exported(nn.Module):
 
 
 def example(agent: str, planes: Sequence[str]) -> dict[str, Tensor]:
-    """Return an example of an agent's observation in two games, whole numbers as int64."""
+    """Return an example of an agent's observation in two games, with whole numbers as int64."""
     game = Packing(2, (7, 6, 8), sides=(2, 4))
     kind = AGENT_KINDS[agent]
     before = (game.orientation_mask.int().argmax(1),) if kind.orientations == 1 else ()
@@ -101,7 +101,7 @@ def example(agent: str, planes: Sequence[str]) -> dict[str, Tensor]:
 
 
 def input_meanings(planes: Sequence[str]) -> dict[str, Meaning]:
-    """Return what the inputs of an agent's file mean, by name, in their order."""
+    """Return the meanings of the inputs of an agent's file, by name, in their order."""
     meanings = dict(ALWAYS_OBSERVED)
     for plane in planes:
         meanings |= PLANES[plane].tensors
@@ -109,10 +109,10 @@ def input_meanings(planes: Sequence[str]) -> dict[str, Meaning]:
 
 
 def training_facts(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the metadata of a checkpoint's files say of its training.
+    """Return the facts about a checkpoint's training for the metadata of its files.
 
-    ``game`` holds the options of :class:`marl_pack.game.spec.GameSpec` with ``items`` and
-    ``sides``, ``trained_items`` the number of items seen, ``seed`` the run's.
+    ``game`` has the options of :class:`marl_pack.game.spec.GameSpec` with ``items`` and ``sides``,
+    ``trained_items`` is the number of items seen, ``seed`` the seed of the run.
     """
     return {
         "game": trained_game(checkpoint),
@@ -127,14 +127,15 @@ def export_onnx(
     """Write one agent as ONNX.
 
     Inputs are the tensors of the agent's observation
-    (:func:`marl_pack.agents.networks.kinds.observe`), whole numbers as int64: ``heightmap``
-    [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and those of the planes
-    that its network sees. Outputs are ``action`` int64 [B] and ``probabilities`` float32 [B, K].
+    (:func:`marl_pack.agents.networks.kinds.observe`), with whole numbers as int64: ``heightmap``
+    [B, W, D], ``item`` [B, 3], ``height`` [B, 1], ``mask`` bool [B, K], and the tensors of the
+    planes that its network sees. Outputs are ``action`` int64 [B] and ``probabilities`` float32
+    [B, K].
 
     Args:
-        actor: the agent's network.
-        agent: its name.
-        path: of the file.
+        actor: the agent's actor.
+        agent: the agent's name.
+        path: the file to write.
         training: facts for the file's metadata (:func:`training_facts`).
 
     Returns:
@@ -146,7 +147,7 @@ def export_onnx(
     observation = example(agent, actor.cnns.planes)
     names = list(observation)
     batch, width, depth = (torch.export.Dim(name, min=1) for name in ("batch", "width", "depth"))
-    # Which dimensions are free follows from their number (marl_pack.agents.networks.kinds.observe).
+    # The number of dimensions determines which are free (marl_pack.agents.networks.kinds.observe).
     free: dict[int, dict[int, object]] = {
         2: {0: batch}, 3: {0: batch, 1: width, 2: depth}, 4: {0: batch, 2: width, 3: depth},
     }  # fmt: skip
@@ -214,13 +215,13 @@ def export_agent(
     form: str,
     training: Mapping[str, Any] | None = None,
 ) -> str:
-    """Write one agent of a checkpoint; return a line that reports it.
+    """Write one agent of a checkpoint; return a line that reports the file.
 
     Args:
-        agent: its record.
-        name: of the agent.
-        folder: to write to.
-        form: ``onnx`` or ``rsl_rl``.
+        agent: the agent's record in the checkpoint.
+        name: the agent's name.
+        folder: the folder to write to.
+        form: the format, ``onnx`` or ``rsl_rl``.
         training: facts for the metadata of an ONNX file (:func:`training_facts`).
     """
     if "network" not in agent:
@@ -238,7 +239,7 @@ def export_agent(
 
 
 def fresh_optimizer(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return the state of an agent's optimiser before its first step, by its run's settings.
+    """Return the state of a new optimiser for an agent, made from its run's settings.
 
     Raises:
         ValueError: if this version cannot read the settings, or the weights do not match them.
@@ -259,9 +260,10 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
 
     Args:
         source: a published model's name, or the path of a checkpoint or a run's folder.
-        folder: to write to; by default the checkpoint's, or ``./NAME`` for a published model.
-        form: ``onnx``, ``rsl_rl`` or ``checkpoint``.
-        console: says what was written.
+        folder: the folder to write to; by default the checkpoint's folder, or ``./NAME`` for a
+            published model.
+        form: the format, ``onnx``, ``rsl_rl`` or ``checkpoint``.
+        console: the console that shows which files were written.
 
     Raises:
         ValueError, OSError: if the checkpoint cannot be read or a file cannot be written.
@@ -286,7 +288,7 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
             line = export_agent(agent, name, folder, form, training)
         console.print(line, soft_wrap=True)
         own = load_afterstate_critic(agent, "cpu")
-        if own is not None and form == "onnx":  # a frozen agent's, of another run
+        if own is not None and form == "onnx":  # the critic of a frozen agent from another run
             export_afterstates(own, folder / f"{name}_afterstate_critic.onnx", training)
     critic = load_afterstate_critic(checkpoint, "cpu")
     if critic is not None and form == "onnx":

@@ -1,7 +1,7 @@
-"""AgileRL: the masked actor-critic as two networks, and observations that hold the mask.
+"""AgileRL: the masked actor-critic as two networks, and observations that contain the mask.
 
-AgileRL reads masks from ``info["action_mask"]`` and does not use them when it learns. So the mask
-is in the observation here, under the name ``legal`` (it refuses ``action_mask`` there), and
+AgileRL reads masks from ``info["action_mask"]`` and does not use them when it learns. So here the
+mask is in the observation, under the name ``legal`` (AgileRL refuses ``action_mask`` there), and
 the networks apply it, also when learning.
 """
 
@@ -29,7 +29,7 @@ class Masked(EvolvableModule):
         super().__init__(device)
         self.agent = agent
         self.network = ActorCritic(agent.partition("_")[0])
-        self.choice: Any = None  # distribution of the last observation's actions
+        self.choice: Any = None  # distribution of actions for the last observation
 
     def outputs(self, observation: Any) -> tuple[torch.Tensor, torch.Tensor]:
         """Return masked logits [B, n] and values [B]."""
@@ -61,12 +61,12 @@ class Critic(Masked):
 
 
 def legal_space(space: Any) -> spaces.Dict:
-    """Return an agent's observation space with the mask under its new name."""
+    """Return an agent's observation space with the mask under the name ``legal``."""
     return spaces.Dict({"observation": space["observation"], "legal": space["action_mask"]})
 
 
 def renamed(observations: dict[str, Any]) -> dict[str, Any]:
-    """Return observations as a batch of one, with the mask under its new name."""
+    """Return observations as batches of size 1, with the mask under the name ``legal``."""
     return {
         agent: {"observation": own["observation"][None], "legal": own["action_mask"][None]}
         for agent, own in observations.items()

@@ -16,10 +16,10 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class PackingTask(PettingZooClass):
-    """The AEC environment as a task: every agent is a group, with exact masks.
+    """The AEC environment as a task in which every agent is a group, with exact masks.
 
-    ``PackingTask("PACKING", {"bin_size": (10, 10, 10)})``: the settings are the options of
-    :func:`marl_pack.env_aec.env`.
+    Example: ``PackingTask("PACKING", {"bin_size": (10, 10, 10)})``. The settings are the arguments
+    of :func:`marl_pack.env_aec.env`.
     """
 
     def make_env(self) -> Any:
@@ -27,9 +27,9 @@ class PackingTask(PettingZooClass):
         return env_aec.env(**self.config)
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: Any, device: Any) -> Any:
-        """Return a function that makes one environment; each has its own items.
+        """Return a function that makes environments, each with its own items.
 
-        BenchMARL gives all environments of a task the same seed, so seeds are counted here.
+        BenchMARL gives all environments of a task the same seed, so here each gets the next seed.
         """
         seeds = count(1000 * (seed or 0))
         return lambda: PettingZooWrapper(
@@ -42,7 +42,7 @@ class PackingTask(PettingZooClass):
         return True
 
     def max_steps(self, env: Any) -> int:
-        """Return a bound for evaluations; an episode ends by itself."""
+        """Return a limit that no evaluation reaches, as episodes end by themselves."""
         return 10**6
 
     def observation_spec(self, env: Any) -> Any:
@@ -54,10 +54,10 @@ class PackingTask(PettingZooClass):
 
 
 class MaskedModel(Model):
-    """An :class:`ActorCritic` with BenchMARL's interface; as a critic it gives values.
+    """An :class:`ActorCritic` with BenchMARL's interface; as a critic it returns values.
 
-    BenchMARL's losses also run over the turns of the other agent. Logits are constant there, so
-    that no gradient reaches the policy; the critic learns the values of these turns.
+    BenchMARL's losses also include the turns of the other agent. Logits are constant there, so
+    that no gradient reaches the policy. The critic learns the values of these turns.
     """
 
     def __init__(self, **arguments: Any) -> None:

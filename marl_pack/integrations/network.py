@@ -1,7 +1,7 @@
 """A small masked actor-critic for the PettingZoo environment, in plain PyTorch.
 
-It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. The agents of
-``marl_pack.train`` observe more and are larger; this one is to be copied and changed.
+It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. Copy it and change
+it. The agents of ``marl-pack train`` are larger and observe more.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class ActorCritic(nn.Module):
     """A network that computes logits and the state's value from one agent's planes and mask.
 
     Args:
-        agent: ``"orientation"`` scores six orientations, ``"placement"`` every cell;
+        agent: ``"orientation"`` scores six orientations, ``"placement"`` scores every cell;
             ``"both"`` is for ``pad_actions=True``, where one network plays both turns.
-        channels: feature planes.
+        channels: number of feature channels.
     """
 
     def __init__(self, agent: str, channels: int = 24) -> None:

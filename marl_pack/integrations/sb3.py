@@ -21,7 +21,7 @@ class Turns(Copied, gymnasium.Env[Any, Any]):
 
     Args:
         env: an AEC environment with ``pad_actions=True``.
-        seed: of the items; the first reset takes it.
+        seed: seed of the items, which the first reset uses.
     """
 
     def __init__(self, env: Any, seed: int) -> None:

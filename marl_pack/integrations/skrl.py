@@ -25,7 +25,7 @@ class MaskedModel(CategoricalMixin, DeterministicMixin, Model):
         self.network = ActorCritic(agent.partition("_")[0])
 
     def act(self, inputs: dict[str, Any], *, role: str = "") -> Any:
-        """Act as the mixin of the role does."""
+        """Call ``act`` of the mixin for this role."""
         mixin = CategoricalMixin if role == "policy" else DeterministicMixin
         return mixin.act(self, inputs, role=role)
 

@@ -22,7 +22,7 @@ def outputs(network: ActorCritic, batch: Any) -> tuple[torch.Tensor, torch.Tenso
 
 
 class Actor(ActionReprNet):
-    """The network's logits, with Tianshou's interface."""
+    """A module with Tianshou's interface that returns the network's logits."""
 
     def __init__(self, network: ActorCritic) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class Actor(ActionReprNet):
 
 
 class Critic(nn.Module):
-    """The network's values, with Tianshou's interface."""
+    """A module with Tianshou's interface that returns the network's values."""
 
     def __init__(self, network: ActorCritic) -> None:
         super().__init__()
@@ -49,11 +49,11 @@ class OwnTurns(MultiAgentOnPolicyAlgorithm):
     """The learners of several agents, each of which learns from its own turns only.
 
     Tianshou treats every turn as a step. Here an agent's reward is the sum of its rewards until
-    its next turn, and its next observation is that of its next turn.
+    its next turn, and its next observation is the observation at its next turn.
     """
 
     def _preprocess_batch(self, batch: Any, buffer: Any, indices: Any) -> Any:
-        """Return the batch of each agent's learner, by the agent's name."""
+        """Return the batch for each agent's learner, by the agent's name."""
         batches = {}
         for column, agent in enumerate(AGENTS):
             own = np.flatnonzero(batch.obs.agent_id == agent)

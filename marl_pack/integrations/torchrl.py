@@ -1,4 +1,4 @@
-"""TorchRL: the masked actor-critic as modules for any leading shape."""
+"""TorchRL: the masked actor-critic as modules that accept any leading dimensions."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class Part(torch.nn.Module):
-    """One of a network's two outputs, for any leading shape; TorchRL adds a dimension of agents.
+    """A module that returns one of a network's two outputs, for any leading dimensions.
 
-    In the other agent's turn TorchRL's mask is full. It is used as empty here, so that logits are
-    constant and no gradient reaches the policy from that turn; the critic learns its value.
+    TorchRL adds a dimension of agents. In the other agent's turn TorchRL's mask is full. Here it is
+    replaced by an empty mask, so that logits are constant and no gradient reaches the policy from
+    that turn. The critic learns the value of that turn.
 
     Args:
         network: the actor-critic.

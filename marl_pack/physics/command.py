@@ -1,9 +1,8 @@
-"""Judge stacks in physics: ``python -m marl_pack.sapien_check COMMAND``.
+"""Judge stacks in physics: the command ``marl-pack judge``.
 
 - ``table1``: the paper's Table 1, objects placed at random under a stability rule;
 - ``controls``: stacks with a known verdict, and the margins at which the judge's verdict flips;
-- ``stack FILE``: packings saved by ``python -m marl_pack.evaluate --save-stacks``; also pictures
-  and films.
+- ``stack FILE``: packings saved by ``marl-pack evaluate --save-stacks``; also pictures and films.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ PROGRAM = "python -m marl_pack.sapien_check"
 
 
 def run_table1(options: argparse.Namespace, console: Console) -> None:
-    """Play, judge and print Table 1."""
+    """Place objects under each rule, judge the stacks, and print the paper's Table 1."""
     if options.objects < 1:
         raise ValueError(f"--objects {options.objects}: needs 1 or more")
     rows: dict[str, dict[str, Any]] = {}
@@ -68,9 +67,9 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
 
 
 def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterator[dict[str, Any]]:
-    """Play and judge one rule, and yield its row of the table after each bin.
+    """Play and judge one rule; yield its row of the table after each bin.
 
-    The bins in which something fell are saved if that is asked for.
+    With ``--save-falls`` the bins in which something fell are saved.
     """
     task = bar.add_task(f"{rule}: objects", total=options.objects)
     path = options.save_falls and falls_file(options.save_falls, rule)
@@ -91,12 +90,12 @@ def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterat
 
 
 def falls_file(path: Path, rule: str) -> Path:
-    """Return the path of the bins in which something fell under one rule."""
+    """Return the path of the file with the bins in which something fell under one rule."""
     return path.with_name(f"{path.name.removesuffix('.npz')}_{rule}.npz")
 
 
 def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -> None:
-    """Print a row for each rule, and the paper's own."""
+    """Print the measured row of each rule, and the row that the paper reports."""
     table = Table(title=title, box=box.SIMPLE, padding=0)
     table.add_column("rule", no_wrap=True)
     for column in ("objects", "falls", "unst.", "stood", "masks s", "s each", "judge"):
@@ -119,9 +118,9 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
             )
     console.print(table)
     console.print(
-        "unst.: falls whose stack the exact equilibrium calls unstable; stood: stacks\n"
-        "that it calls unstable and that did not fall; masks s, s each: seconds of all\n"
-        "masks and of one; judge: seconds of a verdict (CPU time; the paper's own words)"
+        "unst.: falls whose stack is unstable by the exact equilibrium; stood: stacks that\n"
+        "are unstable by it and did not fall; masks s, s each: seconds for all masks and\n"
+        "for one mask; judge: seconds for one verdict (CPU time; as the paper reports it)"
     )
 
 
@@ -129,7 +128,7 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
 
 
 def run_controls(options: argparse.Namespace, console: Console) -> bool:
-    """Judge the controls, print them, and return whether all were judged right."""
+    """Judge the controls and print them; return whether all verdicts are correct."""
     cases = controls.cases()
     outcomes: list[controls.Outcome] = []
     flips: dict[str, float] = {}
@@ -155,7 +154,7 @@ def run_controls(options: argparse.Namespace, console: Console) -> bool:
 def controls_report(
     outcomes: list[controls.Outcome], flips: dict[str, float], options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Return the figures of the controls that have been judged."""
+    """Return the report of the controls that have been judged so far."""
     return {
         "complete": len(flips) == len(controls.FAMILIES),
         "controls": [asdict(o) for o in outcomes],
@@ -170,9 +169,9 @@ def show_controls(
     """Print a row for each stack, with its verdicts at all margins.
 
     Args:
-        outcomes: of the controls that have been judged.
+        outcomes: the outcomes of the controls that have been judged.
         flips: name of a family -> margin in millimetres at which the verdict flips.
-        console: where to print.
+        console: the console to print to.
     """
     right = {of: sum(getattr(o, of) == o.known for o in outcomes)
              for of in ("judge", "equilibrium", "everything")}  # fmt: skip
@@ -193,9 +192,9 @@ def show_controls(
     margins = ", ".join(f"{m:+g}" for m in controls.MARGINS)
     console.print(
         f"{len(outcomes)} controls, the decisive centre {margins} mm inside its support;\n"
-        f"judged right: {right['judge']}; by the exact equilibrium {right['equilibrium']}; "
-        f"where all boxes and walls meet {right['everything']}\n"
-        "flips: how far inside it is where the judge's verdict changes"
+        f"judged correctly: {right['judge']}; by the exact equilibrium {right['equilibrium']}; "
+        f"if all boxes and walls collide {right['everything']}\n"
+        "flips: how far inside the centre is when the judge's verdict changes"
     )
 
 
@@ -235,7 +234,7 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
 def stack_report(
     judged: dict[int, Judged], chosen: Sequence[int], bodies: Bodies, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Return the figures of the packings that have been judged, of those that were chosen."""
+    """Return the report of the chosen packings that have been judged so far."""
     return {
         "file": str(options.file), "complete": len(judged) == len(chosen),
         "packings": len(judged), "placements": sum(j.placements for j in judged.values()),
@@ -254,7 +253,7 @@ def show_judged(judged: dict[int, Judged], console: Console) -> None:
 
     Args:
         judged: number of an episode -> its result.
-        console: where to print.
+        console: the console to print to.
     """
     falls = {e: j.fall for e, j in judged.items() if j.fall is not None}
     for e, fall in list(falls.items())[:20]:
@@ -286,7 +285,7 @@ def in_words(fall: Verdict) -> str:
 
 def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console) -> None:
     """Write the picture or film of one stack."""
-    from marl_pack.physics import film  # needs a renderer, which nothing else does
+    from marl_pack.physics import film  # only this needs a renderer
 
     with make_progress(console) as bar:
         task = bar.add_task("film: boxes", total=len(stack))
@@ -317,15 +316,15 @@ def parser(program: str = PROGRAM) -> Parser:
     shared = Parser(add_help=False)
     add = shared.add_argument_group("physics").add_argument
     add("--friction", type=float, default=DEFAULT.friction,
-        help=f"between all faces (default: {DEFAULT.friction})")  # fmt: skip
+        help=f"friction between all faces (default: {DEFAULT.friction})")  # fmt: skip
     add("--everything", action="store_true",
-        help="let all boxes and the walls collide, as in a real bin: neighbours then prop up what "
-             "would fall")  # fmt: skip
+        help="let all boxes and the walls collide, as in a real bin: neighbours then prop up boxes "
+             "that would fall")  # fmt: skip
     add = shared.add_argument_group("output").add_argument
-    add("--json", type=Path, metavar="FILE", help="write the figures there")
+    add("--json", type=Path, metavar="FILE", help="write the figures to this file")
     several = Parser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    hint = f"that work at once (default: 1; here are {cores} cores)"
+    hint = f"processes that work at once (default: 1; this computer has {cores} cores)"
     several.add_argument_group("computation").add_argument(
         "--processes", type=int, default=1, help=hint
     )
@@ -338,10 +337,11 @@ def parser(program: str = PROGRAM) -> Parser:
     add = first.add_argument_group("objects").add_argument
     add("--rules", nargs="+", choices=list(RULES), default=["hull_1", "hull_alpha"],
         help="stability rules (default: the paper's two)")  # fmt: skip
-    add("--objects", type=int, default=3000, help="placed under each rule (default: 3000)")
-    add("--seed", type=int, default=0, help="of objects and cells (default: 0)")
+    add("--objects", type=int, default=3000,
+        help="number of objects placed under each rule (default: 3000)")  # fmt: skip
+    add("--seed", type=int, default=0, help="seed of objects and cells (default: 0)")
     add("--save-falls", type=Path, metavar="FILE",
-        help="keep the bins in which something fell, as FILE_RULE.npz, for the command "
+        help="save the bins in which something fell as FILE_RULE.npz, for the command "
              "stack")  # fmt: skip
 
     commands.add_parser(
@@ -354,13 +354,18 @@ def parser(program: str = PROGRAM) -> Parser:
         description="Judge saved packings after each of their placements.",
         examples=("plans.npz --processes 2", "plans.csv --episodes 3 --render film.mp4"),
     )  # fmt: skip
-    stack.add_argument("file", type=Path, help="of evaluate --save-stacks or play --save")
     stack.add_argument(
-        "--episodes", nargs="+", type=int, metavar="K", help="which of them (default: all)"
-    )
+        "file", type=Path, help="a file of evaluate --save-stacks or play --save"
+    )  # fmt: skip
+    stack.add_argument(
+        "--episodes", nargs="+", type=int, metavar="K",
+        help="numbers of the episodes to judge (default: all)",
+    )  # fmt: skip
     bodies = stack.add_argument_group("bodies")
     add_body_options(bodies)
-    bodies.add_argument("--seed", type=int, default=0, help="of drawn bodies (default: 0)")
+    bodies.add_argument(
+        "--seed", type=int, default=0, help="seed of drawn densities and centres (default: 0)"
+    )
     add = stack.add_argument_group("film").add_argument
     add("--render", type=Path, metavar="FILE",
         help="show the stack being built: a film (.mp4, .gif) or its end (.png)")  # fmt: skip
@@ -368,7 +373,7 @@ def parser(program: str = PROGRAM) -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
-    """Run the command ``python -m marl_pack.sapien_check``; return its exit status."""
+    """Run the command ``marl-pack judge``; return its exit status."""
     options = parser(program).parse_args(arguments)
     console = make_console()
     try:

@@ -1,4 +1,4 @@
-"""Stacks that are known by statics to stand or to fall, to test the judge.
+"""Stacks that test the judge: by statics it is known whether each stands or falls.
 
 Each family has a margin in millimetres: how far the decisive centre of mass lies inside its support
 (positive: the stack stands; negative: it falls). The exact equilibrium is computed as well.
@@ -23,9 +23,9 @@ MARGINS = (1.0, 0.2, -0.2, -1.0)
 """Millimetres inside the support at which every family is judged."""
 
 SCALE = 1000
-"""Cells in a millimetre for the exact equilibrium, which takes whole cells."""
+"""Cells per millimetre for the exact equilibrium, which takes whole cells."""
 
-WIDEST = 8.0  # millimetres; the verdict is expected to flip within
+WIDEST = 8.0  # millimetres; largest margin at which a flip of the verdict is searched for
 BIN = (1000.0, 1000.0, 2000.0)  # millimetres, so that no wall is near
 
 
@@ -47,8 +47,9 @@ def _plan(
 
     Args:
         rows: x, y, z, w, d, h of each box.
-        mass: kilograms of each box; by default those of filled cartons.
-        last_centre: x, y of the last box's centre of mass from its middle; the others' are there.
+        mass: kilograms of each box; by default the mass of filled cartons.
+        last_centre: x, y of the last box's centre of mass from its middle; the other boxes have
+            their centre of mass in the middle.
     """
     boxes = np.array(rows, np.float64)
     boxes[:, :2] += 300.0 - boxes[:, :2].min(0)
@@ -59,14 +60,14 @@ def _plan(
 
 
 def cube(edge: float, margin: float) -> Plan:
-    """Return a cube half over another's edge."""
+    """Return two cubes: half of the upper cube is over the edge of the lower one."""
     return _plan((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
 
 
 def heavy_on_light(ratio: float, margin: float) -> Plan:
-    """Return the paper's figure: a light box hangs over, and a heavier one stands on its end.
+    """Return the stack of the paper's figure: a heavier box stands on the end of a light overhang.
 
-    The decisive centre is that of both together.
+    The decisive centre of mass is that of both boxes together.
     """
     middle = ((200 - margin) * (1 + ratio) - 150) / ratio
     return _plan(
@@ -76,11 +77,11 @@ def heavy_on_light(ratio: float, margin: float) -> Plan:
 
 
 def harmonic(count: int, margin: float) -> Plan:
-    """Return an overhang of planks, each 5 mm inside its limit, and the lowest by the margin."""
+    """Return an overhang of planks: each is 5 mm inside its limit, the lowest by the margin."""
     length, rows, centre = 300.0, [(0.0, 0.0, 50.0 * (count - 1), 300.0, 100.0, 50.0)], 150.0
     for above in range(1, count):
         slack = margin if above == count - 1 else 5.0
-        x = centre + slack - length  # its edge lies so far beyond the centre of all above
+        x = centre + slack - length  # its edge is so far beyond the centre of all planks above
         rows.append((x, 0.0, 50.0 * (count - 1 - above), length, 100.0, 50.0))
         centre = (centre * above + x + length / 2) / (above + 1)
     return _plan(*rows[::-1])
@@ -113,7 +114,7 @@ def bridge(margin: float) -> Plan:
 
 
 def propped(gap: float, edge: float, margin: float) -> Plan:
-    """Return a cube half over another's edge, with a tall neighbour where it would fall."""
+    """Return the stack of :func:`cube` with a tall neighbour where the upper cube would fall."""
     high = cube(edge, margin).boxes - [300, 300, 0, 0, 0, 0]
     side = high[1, 0] + edge + gap
     return _plan(*map(tuple, high), (side, 0, 0, edge, edge, 3 * edge))
@@ -165,7 +166,7 @@ class Outcome:
     known: bool  # by statics
     judge: bool
     equilibrium: bool
-    everything: bool  # the judge's, with all boxes and the walls colliding
+    everything: bool  # the judge's verdict if all boxes and the walls collide
 
 
 def outcome(name: str, margin: float | None, plan: Plan, physics: Physics = DEFAULT) -> Outcome:
@@ -190,7 +191,7 @@ def cases() -> list[tuple[str, float | None, Plan]]:
 
 
 def flips_at(make: Callable[[float], Plan], physics: Physics = DEFAULT) -> float:
-    """Return the margin in mm at which the judge's verdict flips, to 1 µm; 0 would be right.
+    """Return the margin in mm at which the judge's verdict flips, to 1 µm; 0 would be exact.
 
     NaN if it does not flip within 8 mm.
     """

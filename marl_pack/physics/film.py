@@ -1,7 +1,7 @@
 """Draw pictures and films of a stack as it is built in physics, box by box.
 
 All boxes and the bin's walls collide, so that fallen boxes come to rest as they would in a
-real bin. Drawn by PyVista (VTK), which needs neither a GPU nor a display.
+real bin. PyVista (VTK) draws them; it needs neither a GPU nor a display.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it warns of missing dis
 
 FPS = 25
 EACH = 0.4  # seconds from one box to the next
-REST = 2.0  # seconds after the last, or after a fall
+REST = 2.0  # seconds after the last box, or after a fall
 STEP = Pass(1 / 1000, 50)
 ENDINGS = (".png", ".gif", ".mp4")
 PIXELS = (800, 800)
@@ -46,16 +46,16 @@ class Frame:
 
     middles: Floats  # [k, 3]  metres
     rotations: Floats  # [k, 4]  quaternions, w first
-    moved: tuple[int, ...]  # boxes past a threshold
+    moved: tuple[int, ...]  # boxes that moved by more than a threshold
 
 
 def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
     """Yield the frames of the stack being built; after a fall no more boxes come.
 
-    A box appears at its nominal place while those before it are where they have settled.
+    A new box appears at its nominal place; the earlier boxes are where they have settled.
     """
     physics = replace(physics, everything=True)
-    stack = stack.scaled(1.0)  # in its own size, with masses that a solver can take
+    stack = stack.scaled(1.0)  # in its own size, with masses that the solver can handle
     frame = Frame(np.zeros((0, 3)), np.zeros((0, 4)), ())
     for count in range(1, len(stack) + 1):
         world = World(stack.first(count), physics, STEP)
@@ -69,18 +69,18 @@ def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
 
 
 def _watch(world: World, seconds: float) -> Iterator[Frame]:
-    """Simulate ``seconds`` and yield their frames."""
+    """Simulate a number of seconds and yield the frames."""
     for _ in range(round(seconds * FPS)):
         world.run(1 / FPS)
         yield Frame(*world.poses(), world.moved())
 
 
 class View:
-    """The bin seen from one corner, above, without a window.
+    """A view of the bin from above one corner, drawn without a window.
 
     Args:
         stack: all boxes that will be shown.
-        title: written above, with the number of boxes placed so far.
+        title: the text above the picture; the number of boxes placed so far is added.
     """
 
     def __init__(self, stack: Stack, title: str = "") -> None:
@@ -163,17 +163,17 @@ def render(
     """Write a film of the stack being built (.mp4, .gif), or a picture of its end (.png).
 
     Args:
-        stack: to build.
-        path: of the film or picture.
-        title: written above.
-        physics: in which it is built.
-        progress: called with the number of boxes that stand.
+        stack: the stack to build.
+        path: the file of the film or picture.
+        title: the text above each frame.
+        physics: settings of the simulation.
+        progress: a function that is called with the number of boxes placed so far.
 
     Returns:
         The last frame.
 
     Raises:
-        ValueError: for another ending or a missing folder.
+        ValueError: if the path has another ending or its folder is missing, or the stack is empty.
     """
     check_path(path)
     if not len(stack):

@@ -7,21 +7,21 @@ import argparse
 from marl_pack.sapien_check.bodies import Bodies
 
 BODY_OPTIONS = ("cell", "density", "com_spread")
-"""Names of the options that :func:`add_body_options` adds; each is None unless it is given."""
+"""Names of the options that :func:`add_body_options` adds; an option that is not used is None."""
 
 
 def add_body_options(parser: argparse._ActionsContainer) -> None:
     """Add ``--cell``, ``--density`` and ``--com-spread`` to a command."""
     add = parser.add_argument
     add("--cell", type=float, metavar="METRES",
-        help="edge of a cell (default: the plan's own unit, else the bin's longest side is "
+        help="edge of a cell (default: the plan's own unit; without one the bin's longest side is "
              "0.6 m)")  # fmt: skip
     add("--density", nargs=2, type=float, metavar=("LOW", "HIGH"),
-        help="density of each box, drawn between these, in kg/m³ "
-             "(default: as packed)")  # fmt: skip
+        help="draw the density of each box between these values, in kg/m³ "
+             "(default: the weights of the packing)")  # fmt: skip
     add("--com-spread", type=float, metavar="SHARE",
-        help="centre of mass of each box, drawn up to this share of each side off "
-             "(default: 0)")  # fmt: skip
+        help="draw each box's centre of mass, up to this share of each side away from the given "
+             "one (default: 0)")  # fmt: skip
 
 
 def chosen_bodies(options: argparse.Namespace) -> Bodies:

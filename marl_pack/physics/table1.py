@@ -1,8 +1,8 @@
-"""The paper's Table 1: objects placed at random where a rule allows it, and how many fall.
+"""The paper's Table 1: place objects at random where a rule allows it, and count how many fall.
 
-A bin of 0.6 m in cells of 5 mm; sides uniform in 0.03–0.3 m; each object in its first orientation,
-at a cell drawn uniformly from its mask; physics after every placement. A bin ends when nothing fits
-or something has fallen.
+The bin is a cube of 0.6 m, in cells of 5 mm. The sides of objects are uniform in 0.03–0.3 m. Each
+object is placed in its first orientation, at a cell drawn uniformly from its mask. Physics judges
+the stack after every placement. A bin ends when nothing fits or something has fallen.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "hull_alpha":
         {"objects": 3000, "falls": 1, "rate": 0.0003, "total": 4452.6, "each": "1.48-1.00"},
 }  # fmt: skip
-"""Figures of the paper's own columns: its time cost in all and "per cost", in seconds."""
+"""The figures that the paper reports; its times are the total and "per cost", in seconds."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Trial:
-    """The record of one bin: its n boxes, and verdicts and times after each placement."""
+    """The record of one bin: its n boxes, and the verdicts and times of each placement."""
 
     plan: Plan
     stands: NDArray[np.bool_]  # [n]          by the judge
@@ -62,7 +62,7 @@ class Trial:
     judge_seconds: NDArray[np.float64]  # [n]  CPU time of the verdict
 
     def first(self, n: int) -> Trial:
-        """Return the trial as it was after n placements at most."""
+        """Return the trial with only its first n placements, or all if there are fewer."""
         arrays = {f.name: getattr(self, f.name)[:n] for f in fields(self) if f.name != "plan"}
         return replace(self, plan=self.plan.first(n), **arrays)
 
@@ -119,7 +119,7 @@ def fill(settings: Settings, number: int) -> Trial:
         stack = Stack.of_plan(plan, density=DENSITY)
         stands = check(stack, settings.physics).stands
         judge_seconds = time.process_time() - start
-        # The first time is the placement's own: the next object's mask has been made already.
+        # The first time in the list is for this placement: the next object's mask is made already.
         rows.append((stands, strict_equilibrium(plan), rule.seconds.pop(0), judge_seconds))
         if not stands:
             break
@@ -127,14 +127,14 @@ def fill(settings: Settings, number: int) -> Trial:
 
 
 def run(settings: Settings, objects: int, processes: int = 1) -> Iterator[Trial]:
-    """Fill bin after bin until so many objects have been placed; the last trial is cut short.
+    """Fill bins until a number of objects have been placed; the last trial is cut short.
 
     The objects do not depend on the number of processes.
 
     Args:
         settings: rule, seed and physics.
-        objects: number of placements, 1 or more.
-        processes: that work at once.
+        objects: total number of placements, 1 or more.
+        processes: number of processes that work at once.
     """
     left = objects
     task = partial(fill, settings)
@@ -146,7 +146,7 @@ def run(settings: Settings, objects: int, processes: int = 1) -> Iterator[Trial]
 
 
 def summary(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Compute the figures of one row of the table; times in seconds."""
+    """Compute the figures of one row of the table; times are in seconds."""
     stands, equilibrium, mask, judge = (
         np.concatenate([getattr(trial, name) for trial in trials])
         for name in ("stands", "equilibrium", "mask_seconds", "judge_seconds")

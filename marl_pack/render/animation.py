@@ -15,17 +15,17 @@ from marl_pack.render.picture import draw
 
 PIXELS = (720, 480)
 SECONDS, LAST_SECONDS = 0.6, 3.0
-"""How long each frame is shown, and the last one."""
+"""How long each frame is shown, and how long the last frame is shown."""
 
 
 def frames(plan: Plan, title: str = "") -> Iterator[NDArray[np.uint8]]:
     """Yield a picture of the empty bin, then one after each placement, uint8 [rows, columns, 3].
 
-    Beside the bin stands the box that comes next, as it will be placed.
+    The box that comes next is drawn beside the bin, as it will be placed.
 
     Args:
-        plan: of one bin, in whole cells.
-        title: of each picture, before the number of boxes and the utilization.
+        plan: the boxes of one bin, in whole cells.
+        title: the title of each picture, before the number of boxes and the utilization.
     """
     boxes, (size,) = plan.boxes, plan.bin_sizes.tolist()
     for count in range(len(boxes) + 1):
@@ -40,9 +40,9 @@ def save_gif(path: Path, plan: Plan, title: str = "") -> None:
     """Write an animated GIF of how one bin was packed.
 
     Args:
-        path: of the file.
-        plan: of one bin, in whole cells.
-        title: of each frame.
+        path: the file to write.
+        plan: the boxes of one bin, in whole cells.
+        title: the title of each frame.
 
     Raises:
         OSError: if the file cannot be written.

@@ -1,9 +1,9 @@
 """A picture of one bin: the item to come, the boxes in 3D, and where the item may be placed.
 
 The camera is orthographic and always sees the faces of a box towards +x, -y and +z. Matplotlib's
-3D axes sort what they draw by its middle, which is wrong for boxes of different sizes, so boxes are
-projected here and painted from back to front (:func:`paint_order`). Nothing touches pyplot or any
-other global state, so pictures can be drawn in any thread or process.
+3D axes sort objects by their middles, which is wrong for boxes of different sizes. So boxes are
+projected here and painted from back to front (:func:`paint_order`). This module does not use pyplot
+or any other global state, so pictures can be drawn in any thread or process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PALETTE: tuple[str, ...] = (
     "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
     "#ff9da7", "#a0cbe8", "#ffbe7d", "#8cd17d", "#d4a6c8", "#d7b5a6", "#499894", "#b6992d",
 )  # fmt: skip
-"""Colours of the boxes by order of placement, used in turn."""
+"""Colours of the boxes, in order of placement; after the last colour the first one comes again."""
 
 LEGAL = "#18a558"
 """Colour of the cells where the item may be placed."""
@@ -51,8 +51,8 @@ _PROJECTION = np.array(  # x, y, z to right, up
     ]
 )
 
-# Of a unit box: its corners, its edges, its floor, and round its faces towards +z, +x and -y, the
-# upright ones begun and ended at the bottom.
+# A unit box: its corners, its edges, its floor, and the outlines of its faces towards +z, +x and
+# -y. The outlines of upright faces begin and end at the bottom.
 _CORNERS = np.array(list(product((0, 1), repeat=3)))
 _EDGES = np.array(
     [(c, c + axis) for axis in np.eye(3, dtype=int) for c in _CORNERS if not np.dot(c, axis)]
@@ -74,25 +74,25 @@ def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
     """Return the order in which to paint boxes, from back to front, so that nothing hidden shows.
 
     Box a, moved by t away from the camera in direction v, meets box b while their intervals overlap
-    on every axis. With y reversed all v_k > 0, and that is for::
+    on every axis. With y reversed all v_k > 0, and they overlap for::
 
         max_k (low_a - high_b)_k / v_k  <  t  <  min_k (high_a - low_b)_k / v_k
 
-    As the boxes are disjoint, t = 0 is never among these: if there are any, all are positive, and a
-    hides a part of b, or all are negative, and b hides a part of a.
+    The boxes are disjoint, so t = 0 does not satisfy this. If any t does, then all such t are
+    positive, and a hides a part of b; or all are negative, and b hides a part of a.
 
-    Boxes can hide one another in a ring, so they are painted by levels, one for each height at
-    which a box stands, from the floor upwards. A part above a level is never hidden by a part below
-    it. Boxes that reach through one level are disjoint seen from above, and convex shapes in a
-    plane never hide one another in a ring. So at each level the boxes that reach through it can be
-    painted in order, each from that level upwards. This is needed only for boxes that stand on the
-    level or hide a part of a box painted at it.
+    Boxes can hide one another in a ring, so they are painted by levels: one level for each height
+    at which a box stands, from the floor upwards. A part above a level is never hidden by a part
+    below it. Boxes that reach through one level are disjoint seen from above, and convex shapes in
+    a plane never hide one another in a ring. So at each level the boxes that reach through it can
+    be painted in order, each from that level upwards. This is needed only for boxes that stand on
+    the level or hide a part of a box painted at it.
 
     Args:
         boxes: int [n, 6], rows x, y, z, w, d, h.
 
     Returns:
-        Pairs of a box's index and the height from which upwards it is painted.
+        Pairs of a box's index and a height; the box is painted from that height upwards.
 
     Raises:
         ValueError: if boxes overlap.
@@ -134,19 +134,20 @@ def draw(
 ) -> NDArray[np.uint8]:
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
-    The box placed last has a thick outline, in the bin and on the heightmaps. The item is drawn at
-    the bin's scale, in the colour it will have, and smaller only if there is too little space.
+    The box placed last has a thick outline, in the bin and on the heightmaps. The item has the
+    colour that it will have in the bin. It is drawn at the bin's scale, or smaller if there is too
+    little space.
 
     Args:
         size: (W, D, H) in cells.
         boxes: int [n, 6], rows x, y, z, w, d, h in cells, in order of placement; n may be 0.
         item: w, d, h in cells of the item to come, as it lies now.
         masks: bool [A, W, D], the cells where the item's low corner may lie, in A orientations.
-        labels: a title for each of the A masks, or none.
-        title: of the whole picture.
+        labels: a title for each of the A masks, or an empty sequence.
+        title: the title of the whole picture.
         pixels: (columns, rows) of the picture.
-        leave_space: whether the space of the item stays empty where none comes, so that the bin
-            stands at the same place in every picture.
+        leave_space: whether to leave space for an item even without one, so that the bin is at
+            the same place in every picture.
 
     Returns:
         uint8 [rows, columns, 3], RGB.
@@ -161,7 +162,7 @@ def draw(
     figure = Figure(((columns + 0.5) / dpi, (rows + 0.5) / dpi), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     printable = "".join(c if c.isprintable() or c == "\n" else "?" for c in title)
-    plain = printable.replace("$", r"\$")  # else it would be read as mathematics
+    plain = printable.replace("$", r"\$")  # "$" would start a formula
     figure.text(0.5, 0.975, plain, ha="center", va="top", size=12, color=_INK, wrap=True)
 
     beside = 0.28 if masks is None else 0.18
@@ -182,7 +183,7 @@ def draw(
 
 
 def save(path: str | Path, image: NDArray[np.uint8]) -> None:
-    """Write a picture uint8 [rows, columns, 3] to a file of the kind its name ends in, e.g. PNG."""
+    """Write a picture, uint8 [rows, columns, 3]; the file's ending chooses the format, e.g. PNG."""
     with moved_into_place(Path(path)) as part:
         imsave(part, image)
 
@@ -248,7 +249,7 @@ def _draw_bin(
     outwards = np.array([(-0.45, -1.0), (0.75, -0.8), (1.0, 0.0)])
     for axis, name in enumerate("xyz"):
         side = size[axis]
-        # Each scale begins where the one before it ends, so only the first has a 0.
+        # Each scale begins where the previous one ends, so only the first has a 0.
         ticks = sorted({0, side // 2, side} if name == "x" else {side // 2, side} - {0})
         marks = [(float(tick), str(tick), 9, 8) for tick in ticks]
         for at, text, away, letters in [*marks, (side / 2, name, 22, 10)]:
@@ -333,9 +334,9 @@ def _draw_masks(
 def _axes(
     figure: Figure, rect: _Rect, size: tuple[int, int, int], scale: float = np.inf
 ) -> tuple[Axes, float]:
-    """Return axes for projected points in which a box of ``size`` fills ``rect``, and their scale.
+    """Return axes in which a projected box of ``size`` fills ``rect``, and the scale of the axes.
 
-    The scale is in pixels per cell, and no larger than ``scale``.
+    The returned scale is in pixels per cell, and at most ``scale``.
     """
     axes = figure.add_axes(rect)
     axes.set_axis_off()
@@ -366,7 +367,7 @@ def _add_lines(
             linewidths=width,
             linestyles=style,
             clip_on=False,
-            zorder=1,  # as patches have, so that all is drawn in the order of adding
+            zorder=1,  # the same as for patches, so that all is drawn in the order of adding
         )
     )
 
@@ -383,7 +384,7 @@ def _add_boxes(
     edges: list[float] = []
     for i, level in paint_order(boxes):
         outline = boxes[i, :3] + _FACES * boxes[i, 3:]
-        if level > boxes[i, 2]:  # The upright faces go on below, so they have no edge here.
+        if level > boxes[i, 2]:  # The upright faces continue below, so they have no edge here.
             outline[1:, :, 2] = np.maximum(outline[1:, :, 2], level)
             outline[1:, 4] = outline[1:, 3]
         outlines.extend(_project(outline))

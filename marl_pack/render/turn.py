@@ -1,4 +1,4 @@
-"""Pictures and text of one turn of a game: the bin, the item to come, and where it may go."""
+"""Pictures and text of one turn of a game: the bin, the next item, and where it may be placed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def turn_text(title: str, item: Sequence[int], heightmap: NDArray[np.integer], h
     """Return the turn as text: the title, the item's sides, and the heights seen from above.
 
     Args:
-        title: first line.
-        item: sides along x, y, z in cells.
-        heightmap: [W, D], in cells.
-        height: H.
+        title: the first line.
+        item: the item's sides along x, y, z in cells.
+        heightmap: the height of each column, [W, D], in cells.
+        height: the bin's height H in cells.
     """
     digits = len(str(height))
     rows = [" ".join(f"{h:{digits}d}" for h in column) for column in heightmap.T[::-1].tolist()]
@@ -35,12 +35,12 @@ def turn_picture(
     """Draw the turn, uint8 [rows, columns, 3].
 
     Args:
-        title: of the picture.
-        size: (W, D, H) in cells.
+        title: the title of the picture.
+        size: the bin's sides (W, D, H) in cells.
         boxes: int [n, 6], rows x, y, z, w, d, h in order of placement.
-        item: its own sides w, d, h in cells; zeros where there is none.
-        masks: bool [6, W, D], where it may be placed in each orientation.
-        orientation: the chosen one, once there is one; only its mask is drawn then.
+        item: the item's sides w, d, h as it comes, in cells; zeros if there is no item.
+        masks: bool [6, W, D], where the item may be placed in each orientation.
+        orientation: the chosen orientation, whose mask alone is drawn; None before the choice.
     """
     from marl_pack.render.picture import draw  # matplotlib is slow to import
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 
 class Window:
-    """A window of matplotlib, opened with the first picture."""
+    """A window of matplotlib that opens with the first picture."""
 
     def __init__(self) -> None:
         self._parts: tuple[Any, Any] | None = None  # figure, its picture
 
     def show(self, image: NDArray[np.uint8]) -> None:
-        """Show a picture, uint8 [rows, columns, 3]; all have one size."""
+        """Show a picture, uint8 [rows, columns, 3]; all pictures have the same size."""
         from matplotlib import pyplot
 
         if self._parts is None:

@@ -1,8 +1,8 @@
 """The judge of stacks: it builds a stack box by box in SAPIEN (PhysX) and reports what moved.
 
-It does not depend on how a stack was packed: :class:`Stack` takes a :class:`marl_pack.plan.Plan` or
-rows of boxes, :func:`check` judges it after its last placement and :func:`judge` after each.
-``python -m marl_pack.sapien_check --help`` lists the commands.
+It does not depend on how a stack was packed. :class:`Stack` is made from a
+:class:`marl_pack.plan.Plan` or rows of boxes. :func:`check` judges a stack after its last
+placement, :func:`judge` after each placement. ``marl-pack judge --help`` lists the commands.
 """
 
 from marl_pack.sapien_check.judge import Judged, Verdict, check, judge, judge_all

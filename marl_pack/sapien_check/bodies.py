@@ -1,7 +1,8 @@
-"""The real masses and centres of mass of packed boxes, drawn at random or as packed.
+"""The masses and centres of mass with which the judge simulates packed boxes.
 
-A stability rule computes masks from the weights that it is given. The real ones may differ: drawn
-densities and centres of mass show how well a guarantee holds outside its assumptions.
+A stability rule computes masks from given weights and centres of mass. The real ones may differ:
+densities and centres of mass drawn at random show how well a guarantee holds outside its
+assumptions.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from marl_pack.sapien_check.stack import DENSITY, Stack, cell_of, offsets_of
 
 @dataclass(frozen=True)
 class Bodies:
-    """Settings by which boxes of a plan become bodies with a mass and a centre of mass.
+    """Settings that give each box of a plan a mass and a centre of mass.
 
     Raises:
         ValueError: for an impossible value.
@@ -25,10 +26,10 @@ class Bodies:
 
     cell: float | None = None  # metres of a unit of length; None: see stack.cell_of
     density: tuple[float, float] | None = (
-        None  # kg/m³, drawn between (log-uniform); None: as packed
+        None  # bounds of the drawn density (log-uniform), kg/m³; None: the plan's weights
     )
-    com_spread: float = 0.0  # centre of mass drawn up to so far off, in fractions of w, d, h
-    seed: int = 0  # of the drawn densities and centres
+    com_spread: float = 0.0  # largest drawn shift of a centre of mass, in fractions of w, d, h
+    seed: int = 0  # seed of the drawn densities and centres
 
     def __post_init__(self) -> None:
         low, high = self.density or (DENSITY, DENSITY)
@@ -50,16 +51,16 @@ class Bodies:
     def stack(self, plan: Plan, episode: int) -> Stack:
         """Return the stack of one plan.
 
-        As packed, a box has its weight in units³ of the standard density. A plan does not say how
-        high a centre of mass lies in its box; it is put in the middle, which moves no tipping
-        point.
+        If no density is drawn, a box's mass is its weight in the plan times a unit of length³
+        times the standard density. A plan does not say how high a centre of mass is in its box. It
+        is put in the middle, which moves no tipping point.
 
         Args:
             plan: boxes in one bin.
-            episode: number of the plan; with the seed it decides the drawn values.
+            episode: number of the plan; with the seed it determines the drawn values.
 
         Raises:
-            ValueError: naming the episode and the box, if the stack is impossible.
+            ValueError: if the stack is impossible; names the episode and the box.
         """
         cell = cell_of(plan) if self.cell is None else self.cell
         rng = np.random.default_rng((self.seed, episode))
@@ -76,7 +77,7 @@ class Bodies:
             raise ValueError(f"episode {episode}: {error}") from None
 
     def __str__(self) -> str:
-        """Describe the bodies; empty if all are as packed."""
+        """Describe what is drawn at random; empty if nothing is."""
         words = []
         if self.density is not None:
             words.append(f"densities {self.density[0]:g} to {self.density[1]:g}")

@@ -1,17 +1,18 @@
 """The judge: it builds a stack in SAPIEN (PhysX on the CPU) and checks whether it stands.
 
-After each placement the boxes start at their nominal poses, under gravity; the stack stands
-if none moves or rotates by more than a threshold within a second or so. Why a verdict can be
+After each placement the boxes start at their nominal poses, under gravity. The stack stands
+if no box moves or rotates by more than a threshold within about a second. Why a verdict can be
 trusted:
 
-- Only boxes in nominal vertical contact collide, with one another or with the floor. A neighbour or
-  a wall that touches a box's side would prop it up by friction, or by the solver's tolerance, and
-  hide a box that falls. (:attr:`Physics.everything` lets all of them collide, as in a real bin.)
-- A fall has to survive finer time steps: the solver leaves residues that let a box creep, more so
-  where a heavy box stands on a light one, and these shrink with the step and the solver's
-  iterations where a true fall does not (:attr:`Physics.passes`, :attr:`Physics.heavy`).
+- Boxes collide only with boxes that they touch from above or below, and with the floor. A
+  neighbour or a wall at a box's side would prop it up by friction, or by the solver's tolerance,
+  and hide a fall. (With :attr:`Physics.everything` all of them collide, as in a real bin.)
+- A fall has to happen again at finer time steps. Errors of the solver let a box creep, more so if a
+  heavy box stands on a light one. They shrink with the step and the solver's iterations; a true
+  fall does not (:attr:`Physics.passes`, :attr:`Physics.heavy`).
 - All stacks are judged at one scale of length and mass (:func:`check`).
-- No sleeping, and more time where something creeps: a box at the tipping point begins slowly.
+- Boxes never sleep, and the simulation runs longer if something creeps: a box at the tipping point
+  begins to fall slowly.
 
 A new scene is made for every verdict, so a verdict depends on the stack alone.
 """
@@ -40,9 +41,9 @@ from marl_pack.sapien_check.world import (
 SAMPLE = 0.05  # seconds between looks at the boxes
 CREEP = 0.1  # share of a threshold from which on a box may be about to fall
 LONGEST = 0.3  # metres; boxes are scaled so that their longest side is the paper's longest
-THINNEST = 1 / 50  # of the longest side: below, the thresholds would be a large part of a box
+THINNEST = 1 / 50  # share of the longest side: in thinner boxes a threshold would be a large part
 WIDEST = 3000.0  # ratio of the longest sides of bin and boxes: beyond, boxes may be over 1 km away
-HEAVY = 100.0  # ratio of masses from which on a fall has to survive Physics.heavy as well
+HEAVY = 100.0  # ratio of masses above which a fall has to happen in Physics.heavy as well
 HEAVIEST = 1e4  # ratio of masses beyond which the solver cannot be trusted
 
 
@@ -51,23 +52,23 @@ class Verdict:
     """The movement of k boxes after the last of them was placed."""
 
     stands: bool
-    distance: Floats  # [k]  metres that each box's middle moved, in the last pass, unscaled
+    distance: Floats  # [k]  metres that each box's middle moved in the last pass, unscaled
     angle: Floats  # [k]     degrees that each box rotated
-    moved: tuple[int, ...]  # boxes past a threshold; empty if the stack stands
-    passes: int  # simulations it took
-    seconds: float  # simulated in the last one
+    moved: tuple[int, ...]  # boxes that moved by more than a threshold; empty if the stack stands
+    passes: int  # number of simulations
+    seconds: float  # simulated seconds of the last one
 
 
 def check(stack: Stack, physics: Physics = DEFAULT) -> Verdict:
     """Judge whether the stack stands; all boxes begin at their nominal poses.
 
     Args:
-        stack: the boxes, the last one just placed.
-        physics: how it is simulated.
+        stack: the boxes in order; the last one was placed just now.
+        physics: settings of the simulation.
 
-    Statics knows no scale: whether a stack stands does not change with the unit of length or of
-    mass, but the thresholds, the contacts and the numbers of a solver do. So all stacks are judged
-    at one scale, that of the paper's boxes.
+    Statics has no scale: whether a stack stands does not depend on the unit of length or of
+    mass. But the thresholds, the contacts and the solver's numbers do. So all stacks are judged at
+    one scale, the scale of the paper's boxes.
 
     Raises:
         SimulationError: if the simulation diverges, or the boxes differ too much in size or mass.
@@ -120,11 +121,11 @@ def _simulate(stack: Stack, physics: Physics, step: Pass, groups: list[list[int]
 def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
     """Yield the verdict after each placement, up to the first fall.
 
-    Only boxes that a chain of contacts joins to the one just placed are simulated. The forces on
-    the others are those of their last verdict, which still holds.
+    Only boxes that are connected to the new box by a chain of contacts are simulated. The forces on
+    the other boxes have not changed, so their last verdict still holds.
 
     Raises:
-        SimulationError: as :func:`check`.
+        SimulationError: for the reasons of :func:`check`.
     """
     if not len(stack):
         return
@@ -151,10 +152,10 @@ def judge(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Verdict]:
 class Judged:
     """The result of judging one stack after each of its placements."""
 
-    placements: int  # judged: all, or up to and with the one that fell
-    fall: Verdict | None  # the last verdict, if it was a fall
-    seconds: float  # that the judging took
-    error: str | None = None  # why there is no verdict, of the placement after these
+    placements: int  # number of judged placements, up to the first fall
+    fall: Verdict | None  # the last verdict, if it is a fall
+    seconds: float  # time that judging took
+    error: str | None = None  # why the next placement has no verdict
 
 
 def judge_whole(stack: Stack, physics: Physics = DEFAULT) -> Judged:
@@ -173,9 +174,9 @@ def judge_whole(stack: Stack, physics: Physics = DEFAULT) -> Judged:
 def judge_all(
     stacks: Iterable[Stack], physics: Physics = DEFAULT, processes: int = 1
 ) -> Iterator[Judged]:
-    """Judge many stacks, in their order, by several processes.
+    """Judge many stacks in several processes; yield the results in the order of the stacks.
 
-    With more than one the calling script needs the usual ``if __name__ == "__main__":``.
+    With more than one process the calling script needs ``if __name__ == "__main__":``.
     """
     task: Callable[[Stack], Judged] = functools.partial(judge_whole, physics=physics)
     if processes == 1:

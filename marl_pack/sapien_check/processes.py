@@ -1,4 +1,4 @@
-"""Run tasks in several processes, with their results in order."""
+"""Run tasks in several processes and return their results in order."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ R = TypeVar("R")
 
 
 def in_order(task: Callable[[T], R], inputs: Iterable[T], processes: int) -> Iterator[R]:
-    """Yield ``task`` of each input in order; several processes work a little ahead.
+    """Yield the result of ``task`` for each input, in order; several processes work ahead a little.
 
-    The processes end with this generator, and with the process that runs it, however that ends.
+    The processes end when this generator ends, and when the process that runs it ends in any way.
 
     Raises:
         SimulationError: if a process dies.

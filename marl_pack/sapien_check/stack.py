@@ -1,4 +1,4 @@
-"""Boxes in a bin in metres and kilograms: the judge's view of a plan or of rows of boxes."""
+"""The judge's form of a stack: boxes in a bin, in metres and kilograms."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from marl_pack.plan import Plan
 Floats = NDArray[np.float64]
 
 SLACK = 1e-6 / 0.3
-"""Share of the longest side of the boxes by which faces may miss one another and still count as
-touching, not overlapping: 1e-6 m for the paper's longest box."""
+"""Largest distance between faces that count as touching, and largest overlap that is ignored, as a
+share of the boxes' longest side: 1e-6 m for the paper's longest box."""
 
 MOST_BOXES = 3000
-"""The most boxes of a stack: all pairs of boxes are compared."""
+"""Largest number of boxes in a stack; there is a limit because all pairs of boxes are compared."""
 
 PAPER_BIN = 0.6
 """Edge of the paper's bin in metres (sec. IV-A)."""
 
 DENSITY = 500.0
-"""Density of a filled carton in kg/m³, as the commands assume it. Verdicts depend on the ratios of
-the boxes' masses alone."""
+"""Density of a filled carton in kg/m³, which the commands assume. Verdicts depend only on the
+ratios of the boxes' masses."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ class Stack:
             boxes: [n, 6], rows x, y, z, w, d, h in cells, in order of placement; fractions of a
                 cell are fine.
             cell: edge of a cell in metres; by default the bin's longest side is the paper's 0.6 m.
-            density: kg/m³, one for all or [n]. Either this or ``mass``.
-            mass: kg, one for all or [n].
+            density: density in kg/m³, one for all boxes or [n]. Either this or ``mass``.
+            mass: mass in kg, one for all boxes or [n].
             com_offset: centre of mass from the box's middle in fractions of w, d, h, one for all
-                or [n, 3], each strictly between -0.5 and 0.5.
+                boxes or [n, 3], each strictly between -0.5 and 0.5.
 
         Raises:
-            ValueError: naming the box, if boxes overlap, float, reach out of the bin or have a side
-                that is not positive; for a mass that is not positive, a centre of mass outside its
-                box, or any number that is not finite.
+            ValueError: if boxes overlap, float, reach out of the bin or have a side that is not
+                positive; for a mass that is not positive, a centre of mass outside its box, or any
+                number that is not finite. The message names the box.
         """
         rows = np.asarray(boxes, np.float64)
         if rows.size == 0:
@@ -106,15 +106,15 @@ class Stack:
         """Return the stack of a plan's boxes.
 
         Args:
-            plan: boxes in one bin; of several, ``plan.in_bin(k)`` has one.
-            cell: metres of a unit of length; by default see :func:`cell_of`.
-            density: kg/m³, one for all or [n], in place of the plan's weights.
-            mass: kg, one for all or [n], in place of the plan's weights.
-            com_offset: as :meth:`of_cells` takes it; by default as the plan says, in the middle of
-                the height.
+            plan: boxes in one bin; for a plan of several bins use ``plan.in_bin(k)``.
+            cell: length of the plan's unit in metres; by default :func:`cell_of`.
+            density: density in kg/m³, one for all boxes or [n], instead of the plan's weights.
+            mass: mass in kg, one for all boxes or [n], instead of the plan's weights.
+            com_offset: centres of mass as in :meth:`of_cells`; by default the plan's, in the middle
+                of the height.
 
         Raises:
-            ValueError: as :meth:`of_cells`, or for a plan of several bins.
+            ValueError: for the reasons of :meth:`of_cells`, or for a plan of several bins.
         """
         if len(plan.bin_sizes) != 1:
             raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: needs one, plan.in_bin(k)")
@@ -152,13 +152,13 @@ class Stack:
         return self.only(slice(count))
 
     def only(self, which: slice | NDArray[np.intp]) -> Stack:
-        """Return the stack of the boxes ``which`` alone, in this order."""
+        """Return the stack with only the boxes ``which``, in this order."""
         arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "size"}
         return replace(self, **arrays)
 
     @property
     def slack(self) -> float:
-        """Metres by which faces may miss one another and still count as touching."""
+        """Largest distance in metres between faces that count as touching."""
         return SLACK * float(self.sides.max(initial=0.0))
 
     def rests_on(self) -> NDArray[np.bool_]:
@@ -171,11 +171,11 @@ class Stack:
         """Refuse a stack that cannot exist.
 
         Args:
-            named: rows by which to name the boxes; metres by default.
+            named: the rows that messages show for the boxes; by default in metres.
 
         Raises:
-            ValueError: naming the first box that overlaps an earlier one, floats or reaches out of
-                the bin.
+            ValueError: if a box overlaps an earlier one, floats or reaches out of the bin; names
+                the first such box.
         """
         if len(self) > MOST_BOXES:
             raise ValueError(f"{len(self)} boxes: needs at most {MOST_BOXES}")
@@ -194,19 +194,19 @@ class Stack:
 
 
 def cell_size(size: Sequence[float]) -> float:
-    """Return the edge of a cell in metres, if the bin's longest side is the paper's 0.6 m."""
+    """Return the edge of a cell in metres so that the bin's longest side is the paper's 0.6 m."""
     return PAPER_BIN / float(max(size))
 
 
 def cell_of(plan: Plan) -> float:
-    """Return the metres of a plan's unit; without one, that of :func:`cell_size`."""
+    """Return the length of a plan's unit in metres; for a plan without unit, :func:`cell_size`."""
     return cell_size(plan.bin_sizes[0]) if plan.unit_mm is None else plan.unit_mm / 1000
 
 
 def offsets_of(plan: Plan) -> Floats:
     """Return each centre of mass from its box's middle in fractions of w, d, h, [n, 3].
 
-    A plan does not say its height, so it is in the middle.
+    A plan does not say the height of a centre of mass, so it is in the middle.
     """
     offset = np.zeros((len(plan), 3))
     offset[:, :2] = (plan.centres - plan.positions[:, :2]) / plan.sides[:, :2] - 0.5
@@ -219,7 +219,7 @@ def overlaps(low: Floats, high: Floats) -> Floats:
 
 
 def _each(value: ArrayLike | None, n: int, shape: tuple[int, ...], name: str) -> Floats:
-    """Return one value for all, or one for each, as float64 [n, …]."""
+    """Return a value for each box as float64 [n, …], from one value for all or one for each."""
     values = np.asarray(value, np.float64)
     if values.shape not in (shape, (n, *shape)):
         raise ValueError(f"{name}: shape {values.shape}, needs {shape} or {(n, *shape)}")
@@ -227,7 +227,7 @@ def _each(value: ArrayLike | None, n: int, shape: tuple[int, ...], name: str) ->
 
 
 def _name(i: int, rows: NDArray[np.floating[Any]]) -> str:
-    """Return a box's number and row, as messages name it."""
+    """Return the text by which messages name a box: its number and row."""
     return f"box {i} ({', '.join(f'{value:g}' for value in np.atleast_1d(rows[i]))})"
 
 

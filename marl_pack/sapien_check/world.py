@@ -1,7 +1,6 @@
 """The SAPIEN scene of a stack: the bin, its boxes, gravity, and which bodies collide.
 
-SAPIEN is loaded when the first world is built, so that importing this module needs nothing but
-NumPy.
+SAPIEN is loaded when the first world is built, so that importing this module needs only NumPy.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from marl_pack.extras import missing
 from marl_pack.sapien_check.stack import Floats, Stack, overlaps
 
-GROUND_BIT = 31  # of the collision groups: the floor
+GROUND_BIT = 31  # the bit of the collision groups that stands for the floor
 WALL = 0.05  # metres, thickness of the walls
 
 
@@ -39,13 +38,13 @@ class Physics:
 
     friction: float = 0.5  # static and dynamic, between all faces
     duration: float = 1.0  # seconds that a stack has to stand
-    patience: float = 3.0  # the same where a box is past a tenth of a threshold by then
-    distance: float = 0.003  # metres that the middle of a box may move, once scaled
+    patience: float = 3.0  # seconds if a box has moved by a tenth of a threshold by then
+    distance: float = 0.003  # metres that the middle of a box may move, in the judge's scale
     angle: float = 1.0  # degrees that a box may rotate
-    contact_offset: float = 0.002  # metres from which on contacts are made, once scaled
+    contact_offset: float = 0.002  # metres at which contacts are made, in the judge's scale
     passes: tuple[Pass, ...] = (Pass(1 / 240, 50), Pass(1 / 1000, 25), Pass(1 / 4000, 100))
-    heavy: Pass = Pass(1 / 16000, 200)  # one more where some boxes are far heavier than others
-    everything: bool = False  # all boxes and the walls collide
+    heavy: Pass = Pass(1 / 16000, 200)  # one more if some boxes are far heavier than others
+    everything: bool = False  # whether all boxes and the walls collide
 
     def __post_init__(self) -> None:
         numbers = (self.duration, self.patience, self.distance, self.angle, self.contact_offset)
@@ -59,19 +58,19 @@ DEFAULT = Physics()
 
 
 class SimulationError(RuntimeError):
-    """A stack gets no verdict: its simulation diverged, or it is beyond the judge."""
+    """A stack gets no verdict: its simulation diverged, or it is beyond the judge's limits."""
 
 
 @functools.cache
 def load_sapien() -> Any:
-    """Return the package sapien, loaded when it is first needed.
+    """Return the package ``sapien``; the first call imports it.
 
     Raises:
         ModuleNotFoundError: if it is not installed.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about drivers for rendering, which is not done here
+            warnings.simplefilter("ignore")  # it warns about drivers for rendering, not used here
             import sapien
     except ModuleNotFoundError as error:
         raise missing(error, "the judge needs SAPIEN", "physics") from None
@@ -81,14 +80,14 @@ def load_sapien() -> Any:
 class World:
     """A simulated bin with boxes at their nominal poses, under gravity.
 
-    SAPIEN keeps solver settings for the whole process and takes them when a system and its bodies
-    are made, so each new world changes them.
+    SAPIEN has one set of solver settings for the whole process. It reads them when a system and its
+    bodies are made, so each new world sets them.
 
     Args:
         stack: the boxes.
-        physics: friction, and what collides.
+        physics: friction, and which boxes collide.
         step: time step and iterations.
-        groups: of :func:`collision_groups`, if the caller has computed them.
+        groups: the result of :func:`collision_groups`, if the caller has computed it.
     """
 
     def __init__(
@@ -160,7 +159,7 @@ class World:
             body.entity.set_pose(self.sapien.Pose(middle.tolist(), rotation.tolist()))
 
     def run(self, seconds: float) -> None:
-        """Simulate ``seconds``, to the nearest step."""
+        """Simulate a number of seconds, rounded to whole steps."""
         for _ in range(max(1, round(seconds / self.system.timestep))):
             self.system.step()
 
@@ -180,19 +179,19 @@ class World:
         return middles, rotations
 
     def movement(self) -> tuple[Floats, Floats]:
-        """Return how far each box is from its nominal pose: metres of its middle and degrees, [n].
+        """Return how far each box is from its nominal pose: its middle in metres, and degrees, [n].
 
         Raises:
-            SimulationError: as :meth:`poses`.
+            SimulationError: for the reasons of :meth:`poses`.
         """
         middles, rotations = self.poses()
-        # The vector part's length is the sine of half the angle: exact for small ones.
+        # The vector part's length is the sine of half the angle: exact for small angles.
         vector = np.linalg.norm(rotations[:, 1:], axis=1)
         distance = np.linalg.norm(middles - self.stack.middle, axis=1)
         return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
 
     def moved(self) -> tuple[int, ...]:
-        """Return the boxes that moved past a threshold."""
+        """Return the boxes that moved by more than a threshold."""
         return past(*self.movement(), self.physics)
 
 
@@ -205,19 +204,19 @@ def past(distance: Floats, angle: Floats, physics: Physics, share: float = 1) ->
 def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     """Return SAPIEN's four collision words for each box.
 
-    Two shapes collide if a bit of one's first word is in the other's second. Each box that carries
-    others has one bit as its first word, and those that rest on it have that bit in their second.
-    There are fewer bits than boxes, so boxes share one where nothing that rests on either could
-    come to touch the other before the verdict falls.
+    Two shapes collide if the first word of one and the second word of the other have a common bit.
+    Each box that carries others has one bit as its first word, and the boxes that rest on it have
+    that bit in their second word. There are fewer bits than boxes. So two boxes share a bit if
+    nothing that rests on one of them could touch the other before the verdict is reached.
     """
     n = len(stack)
     if physics.everything:
         every = 1 | 1 << GROUND_BIT
         return [[every, every, 0, 0]] * n
     on = stack.rests_on()
-    near = 2 * (physics.distance + physics.contact_offset)  # both may come closer
+    near = 2 * (physics.distance + physics.contact_offset)  # both boxes may come closer
     gap = -overlaps(stack.low, stack.high)
-    stray = (gap < near).all(-1) & ~on  # [i, j]: i could come to touch j, but does not rest on it
+    stray = (gap < near).all(-1) & ~on  # [i, j]: i could touch j later, but does not rest on it
     np.fill_diagonal(stray, False)
     # j and k may not share a bit if something on j could touch k without resting on it.
     apart = (on.T.astype(np.float32) @ stray.astype(np.float32)) > 0

@@ -28,7 +28,7 @@ from marl_pack.vec_env import PackingVecEnv
 
 
 def rank() -> int:
-    """Return this process's number among those of torchrun; 0 if it is the only one."""
+    """Return the rank of this process under torchrun; 0 if it is the only process."""
     return int(os.environ.get("RANK", "0"))
 
 
@@ -40,7 +40,7 @@ def local_device(config: Config) -> str:
 
 
 def derived_seed(*parts: int) -> int:
-    """Derive a seed from numbers, beyond the range from which users choose seeds."""
+    """Derive a seed from numbers; it differs from the small seeds that users choose."""
     low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
     return int(high >> 1) << 32 | int(low)
 
@@ -49,7 +49,7 @@ def make_stream(config: Config) -> Stream:
     """Return the item stream of the game.
 
     Raises:
-        ConfigError: if the stream cannot bring items for this bin.
+        ConfigError: if the stream has no items for this bin.
     """
     game = config.game
     try:
@@ -81,11 +81,12 @@ def other_agents(
     """Return the records of the frozen agents and of the teachers, by the agents' names.
 
     Args:
-        config: the settings.
-        checkpoint: of the run to resume, which holds them; a teacher only while it is cloned.
+        config: the settings of the run.
+        checkpoint: the checkpoint of the run to resume. It holds the records; the record of a
+            teacher only while it is cloned.
 
     Raises:
-        ConfigError: naming the key, if an agent cannot be loaded.
+        ConfigError: if an agent cannot be loaded; names the key.
     """
     records: dict[str, dict[str, Any]] = {"policy": {}, "teacher": {}}
     for name, agent in agents_of(config).items():
@@ -113,8 +114,8 @@ def runner_settings(
     """Return the configuration of :class:`marl_pack.agents.learning.runner.Runner`.
 
     Args:
-        config: the settings.
-        frozen, teachers: records, as :func:`other_agents` returns them.
+        config: the settings of the run.
+        frozen, teachers: the records that :func:`other_agents` returns.
     """
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
@@ -163,13 +164,13 @@ def make_runner(
     checkpoint: Mapping[str, Any] | None = None,
     **reports: Callable[..., Any],
 ) -> Runner:
-    """Return the runner of a run, resumed if a checkpoint is given.
+    """Return the runner of a run; with a checkpoint, the run is resumed.
 
     Args:
-        config: the settings.
-        folder: of the run; None writes no files.
-        checkpoint: of the run to resume.
-        **reports: ``evaluate``, ``show`` and ``evaluated`` of the runner.
+        config: the settings of the run.
+        folder: the folder of the run; None writes no files.
+        checkpoint: the checkpoint of the run to resume.
+        **reports: the arguments ``evaluate``, ``show`` and ``evaluated`` of the runner.
 
     Raises:
         ConfigError: if a setting is impossible.
@@ -216,7 +217,7 @@ def make_runner(
 
 
 def evaluation(config: Config, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Play held-out sequences with a checkpoint's agents; return the figures of utilization."""
+    """Play held-out sequences with a checkpoint's agents; return the statistics of utilization."""
     device = local_device(config)
     policy = Loader(device, config.evaluation.seed).policy_of(checkpoint)
 

@@ -21,7 +21,7 @@ QUIET_SECONDS = 30.0  # between lines of progress where the output is not a term
 
 
 class Display:
-    """The progress of a run: a bar on a terminal, else a line every 30 seconds."""
+    """The progress of a run: a bar on a terminal; without a terminal, a line every 30 seconds."""
 
     def __init__(self, console: Console, total: int, done: int) -> None:
         self.console, self.total = console, total
@@ -54,7 +54,7 @@ class Display:
 
     @staticmethod
     def lines(progress: Progress) -> list[str]:
-        """Return speed, utilization and reward; then each learner's entropy and KL divergence."""
+        """Return a line with speed, utilization and reward, and one with entropies and KLs."""
         figures = [f"{progress.items_per_second:,.0f} items/s"]
         if not math.isnan(progress.utilization):
             figures.append(f"util {100 * progress.utilization:.1f} %")

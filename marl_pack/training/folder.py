@@ -42,9 +42,9 @@ def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
-    """Write the settings, the command and the packages' versions beside the checkpoints.
+    """Write the settings, the command and the packages' versions into the run's folder.
 
-    The record of a run that is resumed keeps that of its start.
+    If the run is resumed, the new record is added to the record of its start.
     """
     text = yaml.safe_dump(config.to_dict(), sort_keys=False)
     write_atomically(folder / SETTINGS, lambda file: file.write(text.encode()))
@@ -81,15 +81,15 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     except (ValueError, TypeError, KeyError, RecursionError):
         pass
     raise ConfigError(
-        f"{path}: not the record of a run; move it away, resuming needs {checkpoints.LATEST} alone"
+        f"{path}: not the record of a run; move it away; resuming needs only {checkpoints.LATEST}"
     )
 
 
 def _check_free(folder: Path) -> None:
-    """Refuse a folder that holds more than what a run writes before its first checkpoint.
+    """Refuse a folder that contains more than a run writes before its first checkpoint.
 
     Raises:
-        ConfigError: saying what would be right.
+        ConfigError: if the folder contains more; says what would be right.
     """
     if (folder / checkpoints.LATEST).exists():
         raise ConfigError(
@@ -100,7 +100,7 @@ def _check_free(folder: Path) -> None:
 
 
 def _holds_more(folder: Path) -> bool:
-    """Return whether a folder holds more than what a run writes before its first checkpoint."""
+    """Return whether a folder contains more than a run writes before its first checkpoint."""
     names = (path.name for path in folder.iterdir())
     return any(name not in BEFORE_THE_RUN and not name.startswith(PART) for name in names)
 
@@ -121,7 +121,7 @@ def _claimed(folder: Path) -> Iterator[None]:
         remove_unfinished(folder)
         yield
     finally:
-        with contextlib.suppress(OSError):  # it is gone, or holds other files
+        with contextlib.suppress(OSError):  # the folder is gone, or contains other files
             if not (folder / SETTINGS).exists():
                 (folder / LOCK).unlink()
                 folder.rmdir()
@@ -130,12 +130,12 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def new_run(config: Config) -> Iterator[Path]:
-    """Make the folder of a new run, which no other process uses meanwhile.
+    """Make the folder of a new run, and keep other processes from using it meanwhile.
 
-    A run that was killed before its first checkpoint has lost nothing: its folder is free.
+    The folder of a run that was killed before its first checkpoint may be used again.
 
     Raises:
-        ConfigError: if the folder holds something else or cannot be made.
+        ConfigError: if the folder contains something else or cannot be made.
     """
     name = config.output.name
     if name is None:
@@ -155,10 +155,10 @@ def new_run(config: Config) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def run_to_resume(run: str) -> Iterator[Path]:
-    """Return the folder of a run that is to be resumed, which no other process uses meanwhile.
+    """Return the folder of a run to resume, and keep other processes from using it meanwhile.
 
     Args:
-        run: its folder, or its checkpoint.
+        run: the run's folder, or its checkpoint.
 
     Raises:
         ConfigError: if there is no run.
@@ -169,7 +169,7 @@ def run_to_resume(run: str) -> Iterator[Path]:
     folder = path if path.is_dir() else path.parent
     if path == folder and not (path / checkpoints.LATEST).exists():
         if _holds_more(folder):
-            raise ConfigError(f"{run}: needs {checkpoints.LATEST}, as a run's folder has it")
+            raise ConfigError(f"{run}: needs the folder of a run, with {checkpoints.LATEST}")
         if not (folder / SETTINGS).exists():
             raise ConfigError(f"{run}: no run has begun there; train it without --resume")
     with _claimed(folder):
@@ -179,11 +179,11 @@ def run_to_resume(run: str) -> Iterator[Path]:
 def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] | None]:
     """Return the settings and the latest checkpoint of a run to resume.
 
-    A run that was killed before its first checkpoint has none: it begins again.
+    A run that was killed before its first checkpoint has no checkpoint: it begins again.
 
     Args:
-        run: its folder, or its checkpoint.
-        arguments: of the command line, but for --resume.
+        run: the run's folder, or its checkpoint.
+        arguments: the words of the command line without --resume.
 
     Raises:
         ConfigError, FileNotFoundError: if the run cannot be resumed with these arguments.
@@ -207,7 +207,7 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
     for key, value in after.items():
         if value != before[key] and not key.startswith(MAY_CHANGE):
             raise ConfigError(
-                f"--resume: the run has {key} = {before[key]}, not {value}; beside --resume only "
+                f"--resume: the run has {key} = {before[key]}, not {value}; with --resume only "
                 "output.*, evaluation.* and ppo.max_iterations may change"
             )
     done = 0
@@ -222,13 +222,13 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
 
 
 def _check_size(config: Config, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse settings that are not those of the games in a checkpoint, before these are made.
+    """Refuse settings that do not match the games in a checkpoint, before games are made.
 
     Raises:
-        ConfigError: naming what is wrong.
+        ConfigError: if they do not match; names what is wrong.
     """
     states = checkpoint.get("state")
-    if not isinstance(states, list):  # the runner says why that is not enough
+    if not isinstance(states, list):  # the runner refuses it with the reason
         return
     ppo = config.ppo
     try:

@@ -1,4 +1,4 @@
-"""Run a training to its end, or until it is stopped."""
+"""Run a training until its end, or until it is stopped."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ def train(
     arguments: Sequence[str],
     checkpoint: Mapping[str, Any] | None = None,
 ) -> Runner:
-    """Run the training of a run to its end.
+    """Train the agents of one run until its end.
 
     Args:
-        config: the settings.
-        folder: the run's.
-        console: where progress goes.
-        arguments: of the command, for the record.
-        checkpoint: of the run to resume.
+        config: the settings of the run.
+        folder: the folder of the run.
+        console: the console that shows progress.
+        arguments: the words of the command line, for the run's record.
+        checkpoint: the checkpoint of the run to resume.
 
     Raises:
-        RunInterruptedError: after SIGINT or SIGTERM, with a checkpoint written.
+        RunInterruptedError: after SIGINT or SIGTERM; a checkpoint has been written.
         ConfigError, ValueError: if a setting is impossible or the checkpoint cannot be resumed.
     """
     torch.set_num_threads(config.threads)
@@ -94,16 +94,16 @@ def train(
 
 
 def _progress(config: Config, done: int) -> str:
-    """Return where a run that is resumed goes on, for its first line.
+    """Return the text that says where a resumed run continues; empty for a new run.
 
     Args:
-        config: its settings.
-        done: how many iterations it has done.
+        config: the settings of the run.
+        done: number of iterations that the run has done.
     """
     total = config.ppo.max_iterations
     if done >= total:
         return f", has done all its {total:,} iterations; --ppo.max_iterations extends it"
-    return f", goes on after iteration {done:,} of {total:,}" if done else ""
+    return f", continues after iteration {done:,} of {total:,}" if done else ""
 
 
 def start(
@@ -112,11 +112,11 @@ def start(
     """Train a new run or resume one; return the exit status of the command.
 
     Args:
-        program: the command's name, for messages.
-        words: its arguments, for the record.
-        config: the settings of a new run; None to resume one.
+        program: name of the command, for messages.
+        words: the words of the command line, for the run's record.
+        config: the settings of a new run; None to resume a run.
         run: the folder of the run to resume, or its checkpoint.
-        rest: the arguments beside --resume.
+        rest: the words of the command line without --resume.
     """
     console = make_console()
     folder = None
@@ -149,7 +149,7 @@ def start(
         return 1
     except (ConfigError, NotFiniteError, OSError, ModuleNotFoundError) as error:
         nameless = isinstance(error, OSError) and error.errno and not error.filename
-        where = f"{folder}: " if nameless else ""  # as where logs are written
+        where = f"{folder}: " if nameless else ""  # for example when logs cannot be written
         complain(program, f"{where}{error}")
         return 2
     if rank() == 0:
