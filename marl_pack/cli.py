@@ -25,9 +25,10 @@ COMMANDS = {
 
 STATUS = """exit status:
   0    done
-  1    no result: training diverged, a simulation failed, or a control was judged wrongly
-  2    refused: an option, a setting or a file is wrong; the message says what would be
-       right
+  1    no result: training diverged, a simulation failed, or a control was judged
+       wrongly
+  2    refused: an option, a setting or a file is wrong; the message says what would
+       be right
   130  interrupted; files that had been written stay"""
 
 

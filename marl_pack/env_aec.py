@@ -322,7 +322,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             agent's turn.
         mask_in: ``"observation"``; or ``"info"``: then the observation has only the planes, and
             each agent's info has its ``action_mask``.
-        illegal: ``"terminate"``: an illegal action ends the game (in :func:`env`; here it raises
+        illegal: ``"terminate"``: an illegal action ends the game (in ``env``; ``raw_env`` raises
             ``ValueError``); ``"repair"``: the nearest legal action is played, and the agent's info
             says so.
         **options: the other options of the game (``bin`` is ``bin_size`` here):

@@ -46,8 +46,8 @@ class Agent:
         policy: the policy of a frozen agent: {policies}, for the orientation agent also first (as
             the item comes), or a published model, a run's folder or checkpoint.
         network: shape of its network.
-        teacher: the policy whose choices the agent clones at first, with the same values as
-            policy; null for none.
+        teacher: the policy whose choices the agent clones at first, named like policy; null for
+            none.
         teacher_iterations: number of iterations in which it clones the teacher.
         learning_rate: the agent's own learning rate; null for ppo.learning_rate.
         entropy_coef: the agent's own entropy bonus; null for ppo.entropy_coef.
