@@ -1,4 +1,4 @@
-"""Play policies on games to their end, many at once."""
+"""Play episodes with a policy, many games at once."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def play(
 ) -> Rollout:
     """Play episodes 0 … episodes - 1 to their end.
 
-    Args: as :func:`batches`.
+    The arguments are those of :func:`batches`.
     """
     parts = list(batches(policy, game, episodes, progress))
     return Rollout([plan for part in parts for plan in part.plans], sum(p.seconds for p in parts))
@@ -59,12 +59,12 @@ def batches(
     episodes: int,
     progress: Callable[[int], object] = lambda done: None,
 ) -> Iterator[Rollout]:
-    """Play episodes 0 … episodes - 1, and yield those of each batch once it has ended.
+    """Play episodes 0 … episodes - 1 in batches, and yield each batch when it has ended.
 
     Args:
-        policy: of both agents.
+        policy: chooses orientation and cell.
         game: (n, first_episode) → n games without ``auto_reset``.
-        episodes: how many, E.
+        episodes: number of episodes, E.
         progress: called with the number of episodes that have just ended.
 
     Raises:

@@ -13,14 +13,14 @@ from marl_pack.plan import Plan
 from marl_pack.sapien_check.judge import Judged
 
 FEWEST = 10
-"""Number of episodes from which a mean has an interval: with fewer, Student's says nothing."""
+"""Smallest number of episodes for an interval: with fewer, Student's t tells too little."""
 
 
 def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
     """Compute the 95 % interval of the mean (Student's t); None for a single value."""
     if len(values) < 2:
         return None
-    if np.ptp(values) == 0:  # Student's would be NaN
+    if np.ptp(values) == 0:  # Student's t would give NaN
         return float(values[0]), float(values[0])
     from scipy import stats  # slow to import
 
@@ -32,8 +32,8 @@ def mean_utilization(rollout: Rollout) -> dict[str, Any]:
     """Compute mean utilization with its 95 % interval over episodes, and items packed.
 
     Keys ``episodes``, ``utilization``, ``low``, ``high``, ``std``, ``packed``; shares of the bin's
-    volume. The interval is Student's, cut to the shares from 0 to 1, in which every mean lies.
-    Fewer than :data:`FEWEST` episodes have no interval, and one no standard deviation (None).
+    volume. The interval (Student's t) is clipped to shares from 0 to 1. It is None for fewer than
+    :data:`FEWEST` episodes; the standard deviation is None for one episode.
     """
     utilization = rollout.utilization
     low, high = None, None
@@ -52,7 +52,7 @@ def mean_utilization(rollout: Rollout) -> dict[str, Any]:
 def spread(mean: float, bounds: Sequence[float] | None) -> str:
     """Return an interval of a share as text in per cent, such as `` ± 0.52``; empty if None.
 
-    It is the distance to the farther bound where the interval is cut at 0 or 1.
+    If the interval is clipped at 0 or 1, the text shows the distance to the farther bound.
     """
     if bounds is None:
         return ""
@@ -80,18 +80,18 @@ def strict_equilibrium(plan: Plan) -> bool:
     """Return whether the stack in every bin is in strict static equilibrium as a whole (HiGHS).
 
     Raises:
-        ValueError: unless lengths are whole numbers, which the contacts of faces need.
+        ValueError: unless lengths are whole numbers; contacts between faces are exact only then.
     """
     from marl_pack.stability import in_equilibrium
 
     if plan.sides.dtype.kind != "i":
         raise ValueError("the plan has fractions of a unit: needs whole numbers, scale it")
-    bins = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
-    return all(in_equilibrium(own.boxes, own.loads) for own in bins)
+    stacks = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
+    return all(in_equilibrium(stack.boxes, stack.loads) for stack in stacks)
 
 
 def falls(results: Sequence[Judged]) -> dict[str, Any]:
-    """Compute the figures of packings judged in physics.
+    """Compute the figures of packings that the physics engine has judged.
 
     Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
     judged), ``judged_episodes``, ``judged`` (placements) and ``judge_seconds`` (of one placement).
