@@ -174,7 +174,7 @@ def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
     assert remembered == pytest.approx(sorted(last))
     assert all(weight.grad is None for weight in critic.parameters())
     learner.record(game, *policy(game))
-    with pytest.raises(ValueError, match="1 steps recorded: needs a rollout's 4"):
+    with pytest.raises(ValueError, match="1 steps recorded: a rollout needs 4"):
         learner.learn(rewards, rewards, 1e-3)
 
 

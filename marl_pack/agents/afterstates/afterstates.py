@@ -1,11 +1,11 @@
 """Compute where the next boxes could be placed after each legal placement.
 
 The visible item is placed hypothetically at every legal cell. Then ``hull_alpha`` gives the cells
-where the boxes that may come next could be placed: all boxes whose sides have certain lengths. The
-number of cells of each box gives the mean number of feasible cells, and the probability that the
-next item has a feasible cell at all, each box being equally probable.
+where the next box could be placed. The next boxes are all boxes whose sides have certain lengths
+(:func:`probe_lengths`), and each is equally probable. The numbers of cells give the mean number of
+feasible cells, and the probability that the next item has a feasible cell at all.
 
-Compiled loops use as many threads as torch has; tensor code gives the same numbers.
+Compiled loops use as many threads as torch uses; tensor code computes the same numbers.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from marl_pack.installation import njit
 from marl_pack.stability import hull_compiled, hull_tensor
 
 SHARES = 10
-"""Heights are distinguished by tenths of the bin's height."""
+"""Number of classes of heights: tenths of the bin's height."""
 STEPS = 6
-"""Number of kinds of steps between neighbouring columns that are distinguished."""
+"""Number of classes of steps between neighbouring columns, in tenths of the bin's height."""
 SURFACE = SHARES + 1 + STEPS
 """Number of entries of :attr:`Afterstates.surface` for each placement."""
 AT_ONCE = 1 << 20
 """Number of cells of the masks that are computed at once."""
 PER_THREAD = 256
-"""Number of placements from which on several threads share the work."""
+"""Smallest number of placements for which several threads share the work."""
 
 
 def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
@@ -53,21 +53,21 @@ def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
 class Afterstates:
     """The bins after K legal placements; equal placements may share a row."""
 
-    index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere of any
+    index: Tensor  # int64 [N, A, W, D]   row of each legal placement; elsewhere any row
     counts: Tensor  # int32 [K, L, L, L]  cells where each box could be placed: w, d, h
-    surface: Tensor  # float32 [K, 17]    share of the columns on each tenth of the bin's height,
-    # and of the neighbours that differ by so many tenths of it, the last by so many or more
+    surface: Tensor  # float32 [K, 17]    share of columns in each class of heights, then share of
+    # pairs of neighbouring columns in each class of steps (the last class: 5 tenths or more)
     volume: Tensor  # int64 [K]           of the placed box, in cells
-    waste: Tensor  # int64 [K]            cells that it would enclose
-    filled: Tensor  # int64 [K]           cells filled in the bin with it
-    backend: Backend  # computes what is derived from these
+    waste: Tensor  # int64 [K]            empty cells that it would enclose
+    filled: Tensor  # int64 [K]           filled cells of the bin, this box included
+    backend: Backend  # computes the numbers that are derived from these
 
     def select(self, which: Tensor) -> Afterstates:
-        """Return the afterstates of the bins ``which``, int64 [B]; the rows stay the same."""
+        """Return the afterstates of the bins ``which`` (indices int64 [B]); the rows stay."""
         return replace(self, index=self.index[which])
 
     def feasible_cells(self) -> Tensor:
-        """Compute the mean number of cells where a box that may come could be placed.
+        """Compute the mean number of cells where a box that may come next could be placed.
 
         Returns:
             float32 [K].
@@ -95,7 +95,7 @@ class Afterstates:
         return probability.float()
 
     def as_map(self, values: Tensor, mask: Tensor, elsewhere: float = 0.0) -> Tensor:
-        """Return numbers [K] as a map [N, A, W, D]: ``elsewhere`` where the mask is false."""
+        """Return numbers [K] as a map [N, A, W, D], with ``elsewhere`` where the mask is false."""
         if not len(values):
             return torch.full(mask.shape, elsewhere, dtype=values.dtype, device=values.device)
         return torch.where(mask, values[self.index], elsewhere)
@@ -107,7 +107,7 @@ def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[in
     Args:
         bins: N bins.
         sides: int16 [N, A, 3], the item's sides along x, y, z in A orientations.
-        mask: bool [N, A, W, D], where it may be placed.
+        mask: bool [N, A, W, D], where the item may be placed.
         lengths: the L lengths of the next boxes' sides, ascending.
     """
     code = bins.backend.pick(compiled=afterstates_by_compiled_loops, tensor=_tensor)
@@ -119,7 +119,7 @@ def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[in
 
 @njit(cache=True, nogil=True)
 def _placements(mask: Any, sides: Any, index: Any) -> Any:
-    """List bin, orientation, x and y of every legal placement, equal placements once.
+    """List bin, orientation, x and y of every legal placement; equal placements are listed once.
 
     Args:
         mask: bool [N, A, W, D].
@@ -211,7 +211,8 @@ def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any)
 
     Args:
         masks: uint8 [K, L · L, W · D].
-        best_level: integers [K, L · L, W · D], K under the box where the mask is 1.
+        best_level: integers [K, L · L, W · D]; where the mask is 1, half of it (rounded down) is
+            the resting height.
         lengths: int64 [L].
         fitting: int64 [H + 1], see :func:`count_by_masks`.
         counts: int32 [K, L, L, L], written.
@@ -234,7 +235,7 @@ def count_by_masks(
         heightmaps: int16 [K, W, D].
         empty_maps: int16 [K, W, D].
         lengths: int64 [L], ascending.
-        fitting: int64 [H + 1], how many of the lengths are heights that fit above a level.
+        fitting: int64 [H + 1], how many of the lengths fit between each level and the bin's top.
         counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
     """
     n, *shape = heightmaps.shape
@@ -265,14 +266,14 @@ def afterstates_by_compiled_loops(
     """Compute :func:`afterstates_of` in compiled loops.
 
     Args:
-        bins, sides, mask, lengths: as there.
+        bins, sides, mask, lengths: as for :func:`afterstates_of`.
         count_cells: :func:`marl_pack.agents.afterstates.bitboards.count_by_bits` or
-            :func:`count_by_masks`; the faster one that the floor permits if None.
+            :func:`count_by_masks`; by default the faster function that works on the floor.
     """
-    own, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
+    boxes, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
     heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
     index = np.zeros(mask.shape, np.int64)
-    placements = _placements(legal, own, index)
+    placements = _placements(legal, boxes, index)
     count, probes, shape = len(placements), np.array(lengths), bins.size[:2]
     fitting = (probes <= bins.height - np.arange(bins.height + 1)[:, None]).sum(1)
     counts = np.empty((count, *[len(lengths)] * 3), np.int32)
@@ -287,13 +288,13 @@ def afterstates_by_compiled_loops(
     def compute(start: int) -> None:
         part = slice(start, start + most)
         maps = np.empty((2, len(placements[part]), *shape), np.int16)
-        _place_each(heightmap, empty_map, own, placements[part], maps[0], maps[1], waste[part])
+        _place_each(heightmap, empty_map, boxes, placements[part], maps[0], maps[1], waste[part])
         _describe(maps[0], bins.height, surface[part])
         count_cells(maps[0], maps[1], probes, fitting, counts[part])
 
     starts = range(0, count, most)
     list(map(compute, starts) if threads == 1 else _workers(threads).map(compute, starts))
-    volume = torch.from_numpy(own[placements[:, 0], placements[:, 1]].prod(1, dtype=np.int64))
+    volume = torch.from_numpy(boxes[placements[:, 0], placements[:, 1]].prod(1, dtype=np.int64))
     return Afterstates(
         torch.from_numpy(index), torch.from_numpy(counts), torch.from_numpy(surface), volume,
         torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume, bins.backend,
@@ -302,7 +303,7 @@ def afterstates_by_compiled_loops(
 
 @njit(cache=True, nogil=True)
 def _share_feasible(counts: Any, axes: Any, share: Any) -> None:
-    """Write the share of boxes with a feasible cell in one of the orientations.
+    """Write the share of boxes that have a feasible cell in at least one orientation.
 
     Args:
         counts: int32 [K, L, L, L].
@@ -373,5 +374,5 @@ def _probability_tensor(counts: Tensor, axes: list[tuple[int, int, int]]) -> Ten
     """Compute the share of boxes with a feasible cell, float32 [K], in tensor code."""
     feasible = counts > 0
     inverse = [sorted(range(3), key=row.__getitem__) for row in axes]
-    rotated = [feasible.permute(0, *(1 + axis for axis in own)) for own in inverse]
+    rotated = [feasible.permute(0, *(1 + axis for axis in row)) for row in inverse]
     return torch.stack(rotated).any(0).flatten(1).float().mean(1)

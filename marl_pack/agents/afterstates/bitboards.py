@@ -1,11 +1,11 @@
-"""Count feasible cells on floors of at most 128 cells, with sets of cells as bits of two words.
+"""Count feasible cells on floors of at most 128 cells; two 64-bit words hold a set of cells.
 
-Cell (x, y) is bit x · D + y, so a window's cells are its low corner's bit shifted by whole numbers,
-and the corners of all windows that hold a cell of a set are the union of that set's shifts. The
-quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compiled`) is computed here on sets,
-level by level. It looks for windows without a higher cell in which each quadrant around the middle
-holds a bearing cell of that level; windows in which only each half does get the exact test. Corners
-whose windows reach over a row's end are left out.
+Cell (x, y) is bit x · D + y. So the cells of a window are its low corner's bit, shifted by whole
+numbers. The low corners of all windows that contain a cell of a set are the union of shifts of this
+set. The quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compiled`) is computed here
+on sets, level by level. A window without a higher cell is feasible if each quadrant around its
+middle contains a bearing cell of the level. If only each half contains a bearing cell, the exact
+test decides. Corners whose windows reach over the end of a row are left out.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from marl_pack.installation import njit
 MOST_CELLS = 128
 """Number of bits of two words."""
 STEEPEST = 1e6
-"""A rise larger than any to a corner that is not right above."""
+"""The rise to a corner right above the middle: larger than all other rises."""
 
 
 def fit_in_words(width: int, depth: int) -> bool:
-    """Return whether two words can hold a floor's cells, and one word those of a row."""
+    """Return whether a floor's cells fit in two words, and the cells of a row in one word."""
     return width * depth <= MOST_CELLS and depth <= MOST_CELLS // 2
 
 
@@ -72,13 +72,13 @@ def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
 
 @njit(cache=True)
 def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
-    """Find the corners of the windows of every size up to R × S that hold one of ``cells``.
+    """Find the low corners of the windows up to R × S that contain one of ``cells``.
 
     Args:
         cells: uint64 [2], a set.
         depth: D.
         spare: uint64 [2], scratch.
-        boards: uint64 [R + 1, S + 1, 2], written from [1, 1] on.
+        boards: uint64 [R + 1, S + 1, 2], written from [1, 1] on: the corners for each size.
     """
     spare[0], spare[1] = cells[0], cells[1]
     for d in range(1, boards.shape[1]):
@@ -108,13 +108,16 @@ def _highest_bit(word: Any) -> int:
 def _rises(w: int, d: int, rises: Any) -> None:
     """Compute how steeply the hull rises from a window's middle to each of its cells.
 
-    The middle is inside the hull of cells if, both above and below it, the steepest rise to a
-    corner on its left and the steepest to one on its right add up to more than 0. A corner right
-    above counts as the steepest of its cell's side.
+    Add the steepest rise to a corner on the left of the middle and the steepest rise to a corner on
+    its right. The middle is inside the hull of cells if this sum is greater than 0 upwards, and
+    also downwards. A corner right above the middle has the rise :data:`STEEPEST`, on the side of
+    its cell.
 
     Args:
-        rises: float64 [w, d, 2], written: to the cell (x, y)'s upper corners on the left of the
-            middle and on its right; -inf where it has none. For the way down, y from the other end.
+        w, d: size of the window.
+        rises: float64 [w, d, 2], written: the rise to the upper corners of cell (x, y), on the left
+            and on the right of the middle; -inf where there is none. To get the rises downwards,
+            count y from the other end.
     """
     for x in range(w):
         for y in range(d):
@@ -131,7 +134,7 @@ def _rises(w: int, d: int, rises: Any) -> None:
 
 @njit(cache=True)
 def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> tuple[Any, Any]:
-    """Return the set of those of ``corners`` [2] whose windows' middle is in the hull of cells."""
+    """Return the ``corners`` [2] of windows whose middle is inside the hull of ``cells``."""
     inside_low, inside_high = uint64(0), uint64(0)
     row = ~uint64(0) >> uint64(64 - d)
     for word in range(2):
@@ -149,7 +152,7 @@ def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> 
                     up_right = max(up_right, rises[x, top, 1])
                     down_left = max(down_left, rises[x, bottom, 0])
                     down_right = max(down_right, rises[x, bottom, 1])
-            # Rises are fractions of whole numbers up to 128: their sums are 0 or well off it.
+            # Rises are fractions of whole numbers up to 128: a sum that is not 0 is far from 0.
             if up_left + up_right > 1e-6 and down_left + down_right > 1e-6:
                 if word == 0:
                     inside_low |= lowest
@@ -193,11 +196,11 @@ def _levels(heightmap: Any, empty_map: Any, levels: Any) -> None:
 
 @njit(cache=True, inline="always")
 def _decide_word(free: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
-    """Decide windows from the cells in their quadrants: ``a b`` low in x, ``a c`` low in y.
+    """Decide windows from their quadrants: ``a`` and ``b`` low in x, ``a`` and ``c`` low in y.
 
     Returns:
-        The free corners with a cell in all four quadrants, and the other free corners with a cell
-        in each half, which the exact test must decide.
+        The free corners with a cell in all four quadrants, and the free corners that the exact test
+        must decide: those with a cell in each half, but not in each quadrant.
     """
     yes = free & a & b & c & d
     return yes, free & ~yes & (a | b) & (c | d) & (a | c) & (b | d)
@@ -207,7 +210,7 @@ def _decide_word(free: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
 def count_by_bits(
     heightmaps: Any, empty_maps: Any, lengths: Any, fitting: Any, counts: Any
 ) -> None:
-    """Count as ``count_by_masks`` does, on floors for which :func:`fit_in_words` is true."""
+    """Count feasible cells as ``count_by_masks`` does, where :func:`fit_in_words` is true."""
     (width, depth), most = heightmaps.shape[1:], fitting.size
     valid, rises = _window_tables(lengths, width, depth)
     fit_w, fit_d = valid.shape[:2]
@@ -241,7 +244,7 @@ def count_by_bits(
                         free_low = valid[i, j, 0] & ~blocked[j, 0]
                         free_high = valid[i, j, 1] & ~blocked[j, 1]
                         if not (free_low | free_high):
-                            last = j  # nothing longer has a free window on this level either
+                            last = j  # longer boxes have no free window on this level
                             break
                         half_d = (lengths[j] + 1) // 2
                         along = lengths[j] - half_d

@@ -1,9 +1,9 @@
-"""The critic of afterstates, and how it learns.
+"""The critic of afterstates and its learning.
 
-An afterstate is the bin with the item placed and the next one not yet seen (Sutton & Barto 2018,
-sec. 6.8). The critic estimates the return that is still to come from an afterstate's features
-(:mod:`marl_pack.agents.afterstates.features`). It learns from the agents' own returns without the
-reward of the placement itself, once for each update of their PPOs.
+An afterstate is the bin after a placement, before the next item is seen (Sutton & Barto 2018, sec.
+6.8). The critic estimates the return that is still to come from an afterstate's features
+(:mod:`marl_pack.agents.afterstates.features`). It learns from the agents' returns, less the reward
+of the placement itself, once in each PPO update.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from marl_pack.game.packing import Packing
 
 HIDDEN = 64
 REMEMBERED = 1 << 16
-"""Number of afterstates, of the last rollouts, from which the critic learns."""
+"""Number of afterstates from the last rollouts from which the critic learns."""
 PASSES, MINIBATCH = 16, 512
-"""How often the critic learns from an afterstate, on average, and from how many at once."""
+"""How often the critic learns from each afterstate, on average, and the minibatch size."""
 
 
 class AfterstateCritic(nn.Module):
@@ -49,12 +49,12 @@ class AfterstateLearner:
     """The learner that fits the critic to the returns of recent placements.
 
     A placement's return is mostly chance, so the critic learns from many placements: about
-    :data:`REMEMBERED` of the last rollouts, in which the agents were nearly as they are now.
+    :data:`REMEMBERED` from the last rollouts, since when the agents have changed little.
 
     Args:
         critic: the critic.
         lookahead: computes the afterstates.
-        steps, games: T and G of a rollout.
+        steps, games: number of steps T and games G in a rollout.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class AfterstateLearner:
         self.inputs = torch.zeros(*shape, FEATURES, dtype=torch.float16, device=device)
         self.targets = torch.zeros(shape, device=device)
         self.legal = torch.zeros(shape, dtype=torch.bool, device=device)
-        self.rollouts, self.step = 0, 0  # recorded so far, and steps of the next one
+        self.rollouts, self.step = 0, 0  # recorded rollouts; recorded steps of the next rollout
 
     def record(self, game: Packing, orientation: Tensor, cell: Tensor) -> None:
         """Store the afterstates of the chosen placements, int64 [G] each; call before placing."""
@@ -76,30 +76,28 @@ class AfterstateLearner:
         rows = Moves.gather(afterstates.index, orientation, cell)
         position = self.rollouts % self.capacity, self.step
         self.inputs[position] = features(afterstates, game.volume, rows).half()
-        self.legal[position] = Moves.gather(game.mask, orientation, cell)  # else nothing is placed
+        self.legal[position] = Moves.gather(game.mask, orientation, cell)  # else no box
         self.step += 1
 
     def learn(
         self, returns: Tensor, rewards: Tensor, learning_rate: float, processes: int = 1
     ) -> float:
-        """Fit the critic to the recorded rollouts, at the end of each.
+        """Fit the critic to the recorded rollouts; call this at the end of each rollout.
 
         Args:
-            returns: float32 [T, G, 1], of each placement, its reward included.
-            rewards: float32 [T, G, 1].
-            learning_rate: of this update.
+            returns: float32 [T, G, 1], the return of each placement, its reward included.
+            rewards: float32 [T, G, 1], the reward of each placement.
+            learning_rate: the learning rate in this update.
             processes: number of processes that learn together and average their gradients.
 
         Returns:
             The mean squared error.
 
         Raises:
-            ValueError: unless a whole rollout has been recorded.
+            ValueError: if the rollout has not been recorded completely.
         """
         if self.step != self.inputs.shape[1]:
-            raise ValueError(
-                f"{self.step} steps recorded: needs a rollout's {self.inputs.shape[1]}"
-            )
+            raise ValueError(f"{self.step} steps recorded: a rollout needs {self.inputs.shape[1]}")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.targets[self.rollouts % self.capacity] = (returns - rewards).squeeze(-1)
@@ -137,18 +135,18 @@ class AfterstateLearner:
         """Restore the rollouts that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if they are of another run; nothing has changed then.
+            ValueError: if they do not match this run; then nothing is changed.
         """
         names = ("inputs", "targets", "legal")
         rollouts = whole_number(state.get("rollouts"), "afterstates.rollouts", 0)
         stored = min(rollouts, self.capacity)
         for name in names:
-            own, values = getattr(self, name)[:stored], state.get(name)
+            memory, values = getattr(self, name)[:stored], state.get(name)
             if not isinstance(values, Tensor) or (values.dtype, values.shape) != (
-                own.dtype,
-                own.shape,
+                memory.dtype,
+                memory.shape,
             ):
-                raise ValueError(f"afterstates.{name}: needs {own.dtype} {list(own.shape)}")
+                raise ValueError(f"afterstates.{name}: needs {memory.dtype} {list(memory.shape)}")
         for name in names:
             getattr(self, name)[:stored] = state[name]
         self.rollouts = rollouts

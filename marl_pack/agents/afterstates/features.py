@@ -16,13 +16,14 @@ FEATURES = 2 + PAIRS * MOST_LENGTHS + SURFACE
 def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) -> Tensor:
     """Compute the features of afterstates, float32 [K, :data:`FEATURES`].
 
-    They are the filled share of the bin and its square; the logarithms of the numbers of cells
-    where each box that may come could be placed, one number for a footprint and the same footprint
-    rotated by 90°; and the surface. None of them changes when the bin is mirrored or rotated. If
-    boxes have fewer than :data:`MOST_LENGTHS` lengths, these take the places of the longest.
+    The features are the filled share of the bin and its square; for each box that may come next,
+    the logarithm of the number of cells where it could be placed (a footprint and the same
+    footprint rotated by 90° share a feature); and the surface. Mirroring or rotating the bin does
+    not change them. If boxes have fewer than :data:`MOST_LENGTHS` lengths, these use the places of
+    the longest, and the other places are 0.
 
     Args:
-        afterstates: what placements leave.
+        afterstates: the afterstates of the placements.
         volume: W · D · H.
         rows: int64 [K], the placements to describe; all by default.
     """
@@ -31,7 +32,7 @@ def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) 
         counts, surface, filled = counts[rows], surface[rows], filled[rows]
     lengths = counts.shape[1]
     first = MOST_LENGTHS - lengths
-    both = counts + counts.transpose(1, 2)
+    both = counts + counts.transpose(1, 2)  # as it comes and rotated by 90°
     i, j = torch.triu_indices(lengths, lengths, device=counts.device)
     w, _ = torch.triu_indices(MOST_LENGTHS, MOST_LENGTHS, device=counts.device)
     values = torch.zeros(len(counts), FEATURES, device=counts.device)

@@ -26,21 +26,21 @@ AT_ONCE = 1 << 15
 MANY_CELLS = 1000
 """Cells of a floor above which a decision takes more than about a second on a CPU."""
 SLOW = (
-    "seconds a decision on a floor of {width} x {depth} cells: the time of afterstates grows with "
-    "the square of the cells; use larger cells, or a policy that needs none (not max_feasible, no "
-    "planes feasible_cells, feasible_probability, afterstate_value)"
+    "a decision takes seconds on a floor of {width} x {depth} cells: the time of afterstates grows "
+    "with the square of the number of cells; use larger cells, or a policy without afterstates "
+    "(not max_feasible, no planes feasible_cells, feasible_probability, afterstate_value)"
 )
 
 
 class Memo:
-    """A store of results that are computed once a turn, for one turn at a time."""
+    """A store for results that are computed once a turn; it holds the results of one turn."""
 
     def __init__(self) -> None:
         self._turn: object = None
         self._results: dict[Any, Any] = {}
 
     def once(self, game: Packing, name: Any, compute: Callable[[], T]) -> T:
-        """Return the result of this name in the game's turn; compute it if it is not there."""
+        """Return the result ``name`` of the game's turn; compute it if it is not stored."""
         if self._turn is not game.turn:
             self._turn, self._results = game.turn, {}
         if name not in self._results:
@@ -49,11 +49,11 @@ class Memo:
         return result
 
     def forget(self, name: Any) -> None:
-        """Drop a result, so that it is computed again when it is needed."""
+        """Delete a result, so that it is computed again when it is needed."""
         self._results.pop(name, None)
 
     def follow(self, game: Packing, games: Tensor, branched: Packing) -> None:
-        """Carry the results over to the games ``games`` (int64 [K]) of ``game``, now a branch."""
+        """Select the results for ``branched``, a branch of the games ``games`` (int64 [K])."""
         if self._turn is game.turn:
             self._results = {
                 name: result.select(games) if isinstance(result, Afterstates) else result[games]
@@ -76,7 +76,7 @@ class Lookahead:
     ``hull_alpha`` decides where they could be placed, whatever the game's own rule is.
 
     Args:
-        critic: estimates the values of afterstates; None if no agent sees them.
+        critic: estimates the values of afterstates; None if no agent observes them.
         memo: stores the results; shared by players of the same games.
     """
 
@@ -137,7 +137,7 @@ class Lookahead:
         """
         critic = self.critic
         if critic is None:
-            raise ValueError("values of placements need a critic of afterstates: give one")
+            raise ValueError("the values of placements need a critic of afterstates")
 
         def compute() -> Tensor:
             afterstates, spec = self.afterstates(game), game.spec
@@ -158,11 +158,11 @@ class Lookahead:
         return self.memo.once(game, "heightmap", game.bins.heightmap.clone)
 
     def forget_values(self) -> None:
-        """Drop the values of afterstates, after the critic has learned."""
+        """Delete the values of afterstates, after the critic has learned."""
         self.memo.forget(("afterstate_value", self.critic))
 
     def branch(self, game: Packing, games: Tensor) -> Packing:
-        """Return ``game.branch(games)``, for which the turn's results are stored too."""
+        """Return ``game.branch(games)``, and select the turn's results for it."""
         branched = game.branch(games)
         self.memo.follow(game, games, branched)
         return branched
