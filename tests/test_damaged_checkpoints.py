@@ -98,7 +98,7 @@ def test_a_network_whose_outputs_are_no_numbers_does_not_play(
     torch.save(content, path)
     with pytest.raises(SystemExit, match="2"):
         evaluate(["--policy", str(path), "--episodes", "2", *options])
-    assert "an agent's network gives no numbers" in capsys.readouterr().err
+    assert "an agent's network returns NaN" in capsys.readouterr().err
 
 
 def test_a_run_whose_weights_end_up_not_finite_keeps_its_last_checkpoint(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_a_file_that_unpacks_to_more_than_its_size_is_refused_before_it_is_read(
         for k in range(3):
             archive.writestr(f"archive/data/{k}", bytes(1 << 22))
     assert path.stat().st_size < 1 << 15
-    with pytest.raises(ValueError, match="its members are larger than itself"):
+    with pytest.raises(ValueError, match="its members are larger than the file"):
         checkpoints.read(path)
 
 
@@ -318,7 +318,7 @@ def test_every_state_that_games_come_into_is_restored(options: dict[str, Any]) -
     ("afterstate_optimizer/state", {}, "afterstate_optimizer.state.0 is missing"),
     ("agents/placement/optimizer_state_dict/state/0/exp_avg", torch.zeros(2), "0.exp_avg: is"),
     ("agents/placement/optimizer_state_dict/param_groups/0/betas", (2.0, 3.0), "betas: is"),
-    ("agents/placement/network/residual", False, "placement.network: is not that of config"),
+    ("agents/placement/network/residual", False, "placement.network: differs from"),
     ("iter", 5, "schedule_iteration = 1: needs 6 after 6 iterations"),
     ("evaluations", [{"seed": 1}], "evaluations.0.utilization: needs a number"),
     ("config/ppo/num_envs", 1000, "items = 64: needs 4000 after 1 iterations"),

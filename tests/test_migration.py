@@ -225,7 +225,7 @@ def test_another_value_of_a_removed_setting_is_refused(
     for key in where.removeprefix("config.").split("."):
         section[key] = section = dict(section[key])
     section[name] = value
-    with pytest.raises(ValueError, match=rf"{where}\.{name} = {value}: was removed, and only "):
+    with pytest.raises(ValueError, match=rf"{where}\.{name} = {value}: was removed; only "):
         read(tmp_path, checkpoint.pop("agents"), 2, **checkpoint)
 
 

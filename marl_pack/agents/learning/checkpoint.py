@@ -1,4 +1,4 @@
-"""Checkpoints: files that hold their run's settings and rebuild their own policy.
+"""Checkpoints: files with the settings of a run and the networks of its agents.
 
 A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=True)`` reads it):
 
@@ -8,13 +8,13 @@ A checkpoint is a dict of tensors and plain values (``torch.load(weights_only=Tr
   :class:`marl_pack.agents.networks.shape.Network`) and weights as rsl_rl's ``PPO.save()`` gives
   them (``actor_state_dict``, ``critic_state_dict``, ``optimizer_state_dict``), and the record of
   its ``teacher`` while it clones one. A frozen one has its network and the actor's weights, with
-  an ``afterstate_critic`` of its own if it sees values, or the ``name`` of the heuristic that plays
-  it;
-- ``afterstate_critic``: weights of the critic of afterstates that the run owns, if agents see its
-  values, and ``afterstate_optimizer``;
+  an ``afterstate_critic`` of its own if it observes values, or the ``name`` of the heuristic that
+  plays it;
+- ``afterstate_critic`` and ``afterstate_optimizer``: weights of the run's critic of afterstates and
+  the state of its optimiser, if agents observe its values;
 - ``schedule_iteration``, ``iter``, ``items``, ``seconds``, ``evaluations``: the run's progress and
   its evaluations;
-- ``state``: in a run's latest checkpoint only, what resuming needs.
+- ``state``: all else that resuming needs; only in a run's latest checkpoint.
 
 A published checkpoint has only the parts that :func:`without_training` keeps.
 
@@ -51,7 +51,7 @@ from marl_pack.files import write_atomically
 
 FORMAT = 2
 MOST_SHARED = 4
-"""How often the same tensor may stand in a checkpoint, on average."""
+"""How often a checkpoint may contain the same tensor, on average."""
 
 HEURISTICS = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
 """Heuristics that can play an agent, by the agent's name."""
@@ -83,14 +83,14 @@ FORM = {
         "logger": {"tot_timesteps": int, "tot_time": float},
     }],
 }  # fmt: skip
-"""The form of a checkpoint, of every format (:func:`marl_pack.agents.learning.form.check_form`).
+"""The form of a checkpoint in all formats (:func:`marl_pack.agents.learning.form.check_form`).
 
-Settings and networks check the values of their own fields.
+The classes of settings and networks check the values of their fields.
 """
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Write a checkpoint; if that fails, the file that was there stays."""
+    """Write a checkpoint; if writing fails, an earlier file stays as it was."""
     write_atomically(path, lambda file: torch.save(dict(checkpoint), file))
 
 
@@ -99,19 +99,19 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
 
     Args:
         source: as for :func:`resolve`.
-        device: of its tensors.
+        device: the device of its tensors.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such file.
         ValueError: if the file is truncated, of another program or of a newer format, or a value in
-            it has not the form of a checkpoint's (:data:`FORM`).
+            it does not have the form of a checkpoint (:data:`FORM`).
     """
     path = resolve(source)
-    path.open("rb").close()  # raises the system's error if it may not be read
+    path.open("rb").close()  # raises the system's error if it cannot be read
     if not zipfile.is_zipfile(path):
         raise ValueError(
             f"{path}: not a checkpoint, or cut short ({path.stat().st_size:,} bytes); "
-            "use another of the run's files"
+            "use another file of the run"
         )
     unreadable = f"{path}: not a checkpoint that can be read"
     try:
@@ -120,14 +120,14 @@ def read(source: str | Path, device: torch.device | str = "cpu") -> dict[str, An
             # torch compresses nothing, so a file's members are not larger than the file.
             compressed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
             if compressed or sum(member.file_size for member in members) > path.stat().st_size:
-                raise ValueError(f"{unreadable}: its members are larger than itself")
+                raise ValueError(f"{unreadable}: its members are larger than the file")
             if archive.testzip() is not None:  # torch does not look at the checksums
                 raise ValueError(f"{unreadable}: damaged")
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
         raise ValueError(f"{unreadable}: damaged") from None
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-    except Exception:  # of many kinds; their texts advise to trust the file
+    except Exception:  # many types; their messages advise to trust the file
         raise ValueError(f"{unreadable}: holds more than tensors and plain values") from None
     try:
         return _checked(content, path.stat().st_size)
@@ -139,7 +139,7 @@ def _checked(content: Any, size: int) -> dict[str, Any]:
     """Return the content of a file of ``size`` bytes as a checkpoint of this version's format.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if it is not a checkpoint.
     """
     parts = ("format", "agents", "config", "iter", "items")
     if not isinstance(content, Mapping) or any(part not in content for part in parts):
@@ -180,19 +180,19 @@ def _check_player(record: Mapping[str, Any], agent: str, where: str) -> None:
 
 
 def without_training(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a checkpoint without what only the rest of its run needs, to be published.
+    """Return a checkpoint to be published: without the parts that only resuming needs.
 
-    It plays, searches, is exported and begins other runs (``--init``) as before. Where its run was
-    kept is nobody else's concern, so the section ``output`` of its settings is left out too.
+    It can still play, search, be exported and begin other runs (``--init``). The section ``output``
+    of its settings is left out too, because it names folders of the run.
     """
-    own = ("format", "marl_pack", "config", "afterstate_critic", "iter", "items", "seconds")
+    fields = ("format", "marl_pack", "config", "afterstate_critic", "iter", "items", "seconds")
     parts = ("name", "network", "actor_state_dict", "critic_state_dict", "afterstate_critic")
     agents = {
         name: {part: agent[part] for part in parts if part in agent}
         for name, agent in checkpoint["agents"].items()
     }
     settings = {key: value for key, value in checkpoint["config"].items() if key != "output"}
-    slim = {part: checkpoint[part] for part in own if part in checkpoint}
+    slim = {field: checkpoint[field] for field in fields if field in checkpoint}
     return slim | {"config": settings, "agents": agents}
 
 
@@ -210,14 +210,14 @@ def agent_of(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return what one agent needs to play in another run: its network, or a heuristic's name.
+    """Return the record that one agent needs to play: its network, or a heuristic's name.
 
     Args:
         checkpoint: as :func:`read` returns it.
-        name: of the agent.
+        name: the agent's name.
 
     Raises:
-        ValueError: if there is no such agent, or it lacks the critic whose values it sees.
+        ValueError: if there is no such agent, or the critic whose values it observes is missing.
     """
     agent = agent_of(checkpoint, name)
     parts = ("name", "network", "actor_state_dict", "afterstate_critic")
@@ -225,7 +225,7 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
     sees_values = need_critic(record.get("network", {}).get("planes", ()))
     if sees_values and "afterstate_critic" not in record:
         if "afterstate_critic" not in checkpoint:
-            raise ValueError(f"the {name} agent sees values: afterstate_critic is missing")
+            raise ValueError(f"the {name} agent observes values: afterstate_critic is missing")
         record["afterstate_critic"] = checkpoint["afterstate_critic"]
     return record
 
@@ -233,14 +233,15 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
 def check_weights(record: Mapping[str, Any], name: str) -> Network:
     """Return the shape of an agent's network; refuse weights that do not fit it.
 
-    It takes no memory for the network, whose shape may be that of a damaged file.
+    The network takes no memory, because a damaged file may give it any shape.
 
     Args:
-        record: of a learned agent, with the state of its critic and its optimiser or without.
-        name: of the agent.
+        record: the record of a learned agent, with or without the states of critic and optimiser.
+        name: the agent's name.
 
     Raises:
-        ValueError: naming the first tensor that is missing, unknown or of another shape or type.
+        ValueError: the message names the first tensor that is missing, unknown or of another shape
+            or type.
     """
     try:
         network = Network(**record["network"])
@@ -263,10 +264,10 @@ def check_weights(record: Mapping[str, Any], name: str) -> Network:
 
 
 def _check_moments(state: Mapping[str, Any], parameters: Sequence[Tensor]) -> None:
-    """Refuse an optimiser's state that is not of these parameters, which it numbers in order."""
+    """Refuse an optimiser's state that does not match the parameters, numbered in order."""
     for k, values in state.get("state", {}).items():
         for key, value in values.items():
-            own = parameters[k].shape if k in range(len(parameters)) else "none"
-            if isinstance(value, Tensor) and value.dim() and value.shape != own:
+            shape = parameters[k].shape if k in range(len(parameters)) else "none"
+            if isinstance(value, Tensor) and value.dim() and value.shape != shape:
                 where = f"optimizer_state_dict.state.{k}.{key}"
-                raise ValueError(f"{where}: is {described(value)}, its weight is {own}")
+                raise ValueError(f"{where}: is {described(value)}, its weight is {shape}")

@@ -1,4 +1,4 @@
-"""Behaviour cloning: an agent begins by learning the choices of a teacher."""
+"""Behaviour cloning: in its first iterations an agent learns the choices of a teacher."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marl_pack.agents.networks.kinds import AgentKind
 from marl_pack.agents.policy import draw
 from marl_pack.game.packing import Packing
 
-RANDOM_SHARE = 0.1  # of a teacher's choices are replaced, so that the learner keeps exploring
+RANDOM_SHARE = 0.1  # share of a teacher's choices that are random, so that learners explore
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Teacher:
     """The agent whose choices a learner clones, and for how many iterations.
 
     Args:
-        kind: of the teacher and of the learner.
-        agent: the teacher: the games and the choices before → actions int64 [G].
-        iterations: how long the learner clones it.
+        kind: the kind of teacher and learner.
+        agent: the teacher: games and earlier choices of the turn → actions int64 [G].
+        iterations: number of iterations in which the learner clones it.
     """
 
     kind: AgentKind

@@ -1,6 +1,6 @@
-"""Check the form of what a file holds: plain values and tensors, of known types and shapes.
+"""Check the form of a file's content: plain values and tensors of known types and shapes.
 
-Nothing here knows what a checkpoint means (:mod:`marl_pack.agents.learning.checkpoint`).
+The module :mod:`marl_pack.agents.learning.checkpoint` knows the meaning of the values.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from torch import Tensor
 from marl_pack.checks import TYPE_NAMES, described, shown
 
 MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 18, 32, 4096
-"""Limits of a file: number of its values, how deep they are nested, and a text's characters."""
+"""Limits of a file: number of values, depth of nesting, and characters in a text."""
 LONGEST_NAME = 60
-"""Characters of a key that a message shows."""
+"""Number of characters up to which a message shows a key as it is."""
 LARGEST_WHOLE = 1 << 64
 """Whole numbers are smaller than this."""
 
 NAMES = TYPE_NAMES | {Tensor: "a tensor", dict: "a mapping", list: "a list"}
-"""What a value of a type is called in messages."""
+"""Names of types in messages."""
 
 
 class Plain:
-    """A copy of untrusted values in which only plain values and ordinary tensors are left.
+    """A copier of untrusted values that lets only plain values and ordinary tensors pass.
 
-    Mappings become dicts, and subclasses of tensors become tensors. A value may be shared, so a
-    small file can describe many: their number, depth and memory are limited.
+    Mappings become dicts, and subclasses of tensors become tensors. Values may be shared, so a
+    small file can describe very many: their number, depth and memory are limited.
 
     Args:
-        most_bytes: of all tensors together.
+        most_bytes: largest memory of all tensors together.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -44,12 +44,12 @@ class Plain:
         """Return the copy of a value.
 
         Args:
-            value: to copy.
-            where: names it, for messages.
+            value: the value to copy.
+            where: name of the value, for messages.
             depth: how deep it is nested.
 
         Raises:
-            ValueError: naming what is not plain, not finite, or too much.
+            ValueError: if a value is not plain or not finite, or exceeds a limit.
         """
         self.values -= 1
         if self.values < 0 or depth > DEEPEST:
@@ -68,14 +68,14 @@ class Plain:
         return self._single(value, where)
 
     def _key(self, key: Any, where: str) -> Any:
-        """Return a key of a mapping, a text or a whole number."""
+        """Return the key of a mapping, which must be a text or a whole number."""
         if type(key) not in (str, int):
             raise ValueError(f"{where}: has a key that is neither a text nor a whole number")
         return self._single(key, f"{where}: a key")
 
     @staticmethod
     def _single(value: Any, where: str) -> Any:
-        """Return a value that is not made of others."""
+        """Return a value that must be plain and contain no other values."""
         if type(value) is str:
             if len(value) > LONGEST_TEXT:
                 raise ValueError(f"{where}: a text of more than {LONGEST_TEXT} characters")
@@ -83,7 +83,7 @@ class Plain:
                 raise ValueError(f"{where}: a text with control characters, {shown(value)}")
         elif type(value) is int:
             if abs(value) >= LARGEST_WHOLE:
-                raise ValueError(f"{where}: {shown(value)} is too large, needs 64 bits")
+                raise ValueError(f"{where}: {shown(value)} is too large, needs at most 64 bits")
         elif type(value) is float:
             if not math.isfinite(value):
                 raise ValueError(f"{where}: is {value}, needs a finite number")
@@ -92,7 +92,7 @@ class Plain:
         return value
 
     def _tensor(self, value: Tensor, where: str) -> Tensor:
-        """Return a tensor without the traits that a file could give it."""
+        """Return an ordinary dense tensor with the same numbers."""
         if value.layout != torch.strided or value.is_quantized or value.is_meta:
             raise ValueError(f"{where}: needs an ordinary dense tensor")
         self.bytes -= value.numel() * value.element_size()
@@ -105,28 +105,28 @@ class Plain:
 
 
 def _below(where: str, key: object) -> str:
-    """Return the name of a value in another one."""
+    """Return the name of the value ``key`` in the value ``where``, for messages."""
     name = key if type(key) is str and len(key) <= LONGEST_NAME else shown(key)
     return f"{where}.{name}" if where else name
 
 
 Form = Any
-"""A form of values: a type, a tuple of types, a dict from keys to forms, from a type of keys to a
-form, or a list of one form (for each entry) or of several (one for each entry)."""
+"""The form of a value: a type or a tuple of possible types; a dict from keys (or a type of keys) to
+forms; a list with one form for all entries, or with a form for each entry."""
 
 
 def check_form(value: Any, form: Form, where: str) -> None:
-    """Refuse a value that has another form; keys that the form does not name are left alone.
+    """Refuse a value that has another form; keys that the form does not name are not checked.
 
     Raises:
-        ValueError: naming the first value that is wrong, and what would be right.
+        ValueError: the message names the first wrong value and says what it needs to be.
     """
     if isinstance(form, dict):
         _check_type(value, dict, where)
         for key, item in value.items():
-            own = form.get(key, form.get(type(key)))
-            if own is not None:
-                check_form(item, own, _below(where, key))
+            form_of_item = form.get(key, form.get(type(key)))
+            if form_of_item is not None:
+                check_form(item, form_of_item, _below(where, key))
             elif str not in form and int in form:
                 raise ValueError(f"{where}: has the key {shown(key)}, needs whole numbers")
     elif isinstance(form, list):
@@ -143,7 +143,7 @@ def check_no_tensors(value: Any, where: str) -> None:
     """Refuse a tensor in nested values.
 
     Raises:
-        ValueError: naming the first one.
+        ValueError: the message names the first tensor.
     """
     if isinstance(value, Tensor):
         raise ValueError(f"{where}: is a tensor, needs a plain value")
@@ -156,24 +156,24 @@ def check_no_tensors(value: Any, where: str) -> None:
 
 
 def _check_type(value: Any, form: type | tuple[type, ...], where: str) -> None:
-    """Refuse a value of another type; a whole number is a number, a tuple is a list."""
+    """Refuse a value of another type; whole numbers count as numbers, tuples as lists."""
     types = form if isinstance(form, tuple) else (form,)
-    own = {float: (float, int), list: (list, tuple), dict: (dict, OrderedDict)}
-    if not any(type(value) in own.get(t, (t,)) for t in types):
+    accepted = {float: (float, int), list: (list, tuple), dict: (dict, OrderedDict)}
+    if not any(type(value) in accepted.get(t, (t,)) for t in types):
         needs = " or ".join(NAMES[t] for t in types)
         raise ValueError(f"{where}: needs {needs}, not {described(value)}")
 
 
 def check_alike(value: Any, own: Any, where: str) -> None:
-    """Refuse a value that differs in form from another: in keys, types, dtypes or shapes.
+    """Refuse a value that differs from another in keys, types, dtypes or shapes.
 
     Args:
-        value: to check.
-        own: a value of the right form; what it holds does not matter.
-        where: names the value, for messages.
+        value: the value to check.
+        own: a value of the right form; its numbers do not matter.
+        where: name of the value, for messages.
 
     Raises:
-        ValueError: naming the first value that is wrong, and what would be right.
+        ValueError: the message names the first wrong value and says what it needs to be.
     """
     if isinstance(own, Tensor):
         if not isinstance(value, Tensor) or (value.dtype, value.shape) != (own.dtype, own.shape):
@@ -190,10 +190,10 @@ def check_alike(value: Any, own: Any, where: str) -> None:
 def check_keys(
     value: Mapping[Any, Any], keys: Sequence[Any], where: str, also: Sequence[Any] = ()
 ) -> None:
-    """Refuse a mapping that lacks one of the keys or has others, but for those of ``also``.
+    """Refuse a mapping that lacks one of ``keys`` or has a key in neither ``keys`` nor ``also``.
 
     Raises:
-        ValueError: naming the first key that is missing or unknown.
+        ValueError: the message names the first key that is missing or unknown.
     """
     for key in keys:
         if key not in value:

@@ -1,4 +1,4 @@
-"""rsl_rl's logger, silent on the terminal, that reports each iteration to a function."""
+"""A logger of rsl_rl that does not print, and reports each iteration to a function."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from marl_pack.extras import missing
 
 @dataclass(frozen=True)
 class Progress:
-    """What one iteration brought, for whoever shows it."""
+    """The figures of one iteration."""
 
-    iteration: int  # those done, this one included
+    iteration: int  # number of iterations done, this one included
     items: int  # items placed since the run began, by all processes
     items_per_second: float  # in this iteration
     seconds: float  # spent learning since the run began
     utilization: float  # mean of the episodes that ended in this iteration; NaN if none did
     reward: float  # mean return of the last 100 episodes; NaN before the first
-    losses: dict[str, float]  # of :meth:`marl_pack.agents.learning.ppo.PackingPPO.update`
+    losses: dict[str, float]  # from :meth:`marl_pack.agents.learning.ppo.PackingPPO.update`
 
 
 class IterationLogger(Logger):
-    """rsl_rl's logger, silent on the terminal, that reports each iteration to a function."""
+    """A logger of rsl_rl that does not print, and reports each iteration to a function."""
 
     report: Callable[[Progress], None]
 
     def init_logging_writer(self) -> None:
-        """Open the writer, and keep the state of the code beside its logs."""
+        """Open the writer, and store the state of the code in the folder of the logs."""
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 super().init_logging_writer()
@@ -50,7 +50,7 @@ class IterationLogger(Logger):
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict, **others)
         batch = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
-        if self.writer is None:  # rsl_rl counts where it logs; the other processes must agree
+        if self.writer is None:  # rsl_rl counts only in the process that logs
             self.tot_timesteps += batch
             self.tot_time += collect_time + learn_time
         rewards = self.rewbuffer

@@ -1,8 +1,8 @@
 """Migrate checkpoints that earlier versions wrote.
 
-Format 1 had other names for planes, policies and settings, and kept the critic of afterstates once
-in each actor's weights. The games in play that it stored cannot be resumed. Both formats may hold
-settings that were removed since.
+Format 1 had other names for planes, policies and settings, and stored the critic of afterstates in
+each actor's weights. Its unfinished games cannot be resumed. Both formats may contain settings that
+were removed later.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from marl_pack import renamed
 from marl_pack.checks import shown
 
 CRITIC = "afterstates."
-"""Prefix of the critic's weights among an actor's."""
+"""Prefix of the critic's weights among the weights of an actor."""
 
 UNRESUMABLE = (
     "an earlier version wrote it, and its games in play cannot be continued; begin a new run with "
-    "--init and the settings of the old one"
+    "--init and the settings of the old run"
 )
 
 
 BEFORE = {"shortcut": False, "context": False}
-"""What a network of format 1 is where its shape does not say so: the first had neither."""
+"""Fields that the shape of a network may lack in format 1: the first networks had neither."""
 
 
 def without_removed(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a checkpoint without the settings that were removed since.
+    """Return a checkpoint without the settings that were removed later.
 
     Raises:
-        ValueError: if one of them has another value than the one that still holds.
+        ValueError: if a removed setting has a value that is not supported any more.
     """
     current = dict(checkpoint)
     current["config"] = _without_removed(checkpoint["config"], "config")
@@ -42,7 +42,7 @@ def without_removed(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _record_without_removed(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return an agent's record without removed settings in its network, and in its teacher's."""
+    """Return an agent's record without removed settings, its teacher's record included."""
     current = dict(record)
     if "network" in record:
         current["network"] = _without_removed(record["network"], f"{where}.network")
@@ -52,7 +52,7 @@ def _record_without_removed(record: Mapping[str, Any], where: str) -> dict[str, 
 
 
 def _without_removed(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return settings without removed ones, those of their sections included."""
+    """Return settings without the removed ones, sections included."""
     current = {}
     for name, value in settings.items():
         key = f"{where}.{name}"
@@ -62,7 +62,7 @@ def _without_removed(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
             current[name] = _without_removed(value, key) if inner else value
         elif type(value) is not type(removed.value) or value != removed.value:
             raise ValueError(
-                f"{key} = {shown(value)}: was removed, and only {removed.value} can be read: "
+                f"{key} = {shown(value)}: was removed; only {removed.value} can still be read: "
                 f"{removed.now}"
             )
     return current
@@ -81,7 +81,7 @@ def from_format_1(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     }
     for record in checkpoint["agents"].values():
         critic = _critic(record.get("actor_state_dict", {}))
-        if critic and "optimizer_state_dict" in record:  # the run's own, the same in each agent
+        if critic and "optimizer_state_dict" in record:  # the same in each agent
             migrated["afterstate_critic"] = critic
     if "afterstates" in migrated:
         migrated["afterstate_optimizer"] = migrated.pop("afterstates")
@@ -112,7 +112,7 @@ def _network(network: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _critic(weights: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the weights of the critic of afterstates among an actor's."""
+    """Return the weights of the critic of afterstates among the weights of an actor."""
     return {key.removeprefix(CRITIC): w for key, w in weights.items() if key.startswith(CRITIC)}
 
 
@@ -142,8 +142,8 @@ def _agent(record: Mapping[str, Any], learns: bool) -> dict[str, Any]:
 def _optimizer(state: Mapping[str, Any], first: int, count: int) -> dict[str, Any]:
     """Return an optimiser's state without ``count`` parameters from number ``first`` on.
 
-    An optimiser numbers its parameters: the actor's, which ended with the critic of afterstates,
-    then the critic's.
+    An optimiser numbers its parameters: first those of the actor, which ended with the critic of
+    afterstates, then those of the critic.
     """
 
     def number(old: int) -> int:
@@ -154,5 +154,5 @@ def _optimizer(state: Mapping[str, Any], first: int, count: int) -> dict[str, An
         dict(group) | {"params": [number(p) for p in group["params"] if p not in dropped]}
         for group in state["param_groups"]
     ]
-    own = {number(p): value for p, value in state["state"].items() if p not in dropped}
-    return {"state": own, "param_groups": groups}
+    moments = {number(p): value for p, value in state["state"].items() if p not in dropped}
+    return {"state": moments, "param_groups": groups}

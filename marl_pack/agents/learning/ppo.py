@@ -1,7 +1,7 @@
-"""PPO for agents that take turns: one stock rsl_rl ``PPO`` each, driven as if they were one.
+"""PPO for agents that take turns: each has a stock rsl_rl ``PPO``; the runner sees one algorithm.
 
 Within a step the orientation agent acts first. The placement agent then observes the item in the
-chosen orientation and acts. Both store the same reward and the same end of episode (Eq. 3 – 5), and
+chosen orientation and acts. Both store the same reward and the same end of episode (Eq. 3 – 5);
 each computes its advantages over its own turns. A frozen agent plays without learning. An agent
 that clones a teacher plays as the teacher does; all its choices have the same advantage, so that
 PPO makes them more probable.
@@ -37,12 +37,12 @@ class Seat:
     """One agent's place in a step: a learner with its PPO, or an agent that is frozen.
 
     Args:
-        kind: of the agent.
-        ppo: of a learner; None where ``frozen`` plays.
-        frozen: plays in place of a learner: the games and the choices before → actions int64 [G].
+        kind: the agent's kind.
+        ppo: a learner's PPO; None for a frozen agent.
+        frozen: a frozen agent: games and earlier choices of the turn → actions int64 [G].
         planes: extra planes that a learner observes.
         schedule: a learner's settings for :meth:`anneal`.
-        teacher: a learner clones its choices at first.
+        teacher: the teacher whose choices a learner clones in its first iterations.
     """
 
     kind: AgentKind
@@ -58,7 +58,7 @@ class Seat:
         return teacher if teacher and iteration < teacher.iterations else None
 
     def act(self, observation: TensorDict, game: Packing, before: Choice, iteration: int) -> Tensor:
-        """Return the actions int64 [G], and record a learner's in its storage."""
+        """Return the actions int64 [G]; a learner records them in its storage."""
         if self.ppo is None:
             return self._play_frozen(game, before)
         action = self.ppo.act(observation)
@@ -87,9 +87,9 @@ class Seat:
         return self.frozen(game, *before)
 
     def anneal(self, progress: float) -> None:
-        """Set learning rate and entropy bonus for a share of the run that is done, 0 … 1."""
+        """Set learning rate and entropy bonus for ``progress``, the share 0 … 1 of the run done."""
         assert self.ppo is not None, "only learners have a schedule"
-        assert self.schedule is not None, "a learner has one"
+        assert self.schedule is not None, "a learner has a schedule"
         first, last = self.schedule["entropy_coef"], self.schedule["final_entropy_coef"]
         self.ppo.entropy_coef = first + progress * (last - first)
         if self.schedule["schedule"] == "linear":
@@ -99,14 +99,14 @@ class Seat:
 
 
 class PackingPPO:
-    """The algorithm of rsl_rl's ``OnPolicyRunner``: all learners, and the critic of afterstates.
+    """The algorithm for rsl_rl's ``OnPolicyRunner``: all learners and the critic of afterstates.
 
     Args:
         seats: the agents, in the order of their turns.
         env: the games.
-        lookahead: what placements leave, and its value; shared by all learners.
-        iterations: how many there will be, for the schedules.
-        afterstates: fits the critic of afterstates, if agents see its values.
+        lookahead: computes afterstates and their values; shared by all learners.
+        iterations: number of iterations of the run, for the schedules.
+        afterstates: fits the critic of afterstates; None if no agent observes its values.
 
     Raises:
         ValueError: if no agent learns.
@@ -138,7 +138,7 @@ class PackingPPO:
     # --- the rollout ------------------------------------------------------------------------------
 
     def _observation(self, seat: Seat, before: Choice, first: TensorDict) -> TensorDict:
-        """Return what an agent observes at its turn; ``first`` in the first turn."""
+        """Return what an agent observes at its turn: ``first`` if its turn is the first."""
         if not before or seat.ppo is None:
             return first
         game = self.env.game
@@ -146,7 +146,7 @@ class PackingPPO:
         return TensorDict(observation, batch_size=[game.n], device=game.device)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Return all agents' choices, int64 [G, 2]: orientation and cell; record the learners'.
+        """Return the chosen orientations and cells, int64 [G, 2]; record the learners' choices.
 
         Args:
             obs: as the environment's ``get_observations`` returns it.
@@ -172,8 +172,8 @@ class PackingPPO:
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute the advantages of the rollout that ends at ``obs``.
 
-        Each agent's return is completed by its own value at its next turn. The choices of the
-        agents before it are drawn, and not recorded.
+        Each agent's return is completed by its critic's value at its next turn. The choices of the
+        earlier agents in that turn are drawn, but not recorded.
         """
         self._last = obs
         game = self.env.game
@@ -216,7 +216,7 @@ class PackingPPO:
             losses[f"{name}/learning_rate"] = ppo.learning_rate
         self.iteration += 1
         if self.afterstates is not None and self._last is not None:
-            with torch.inference_mode():  # its values are those of the critic before it learned
+            with torch.inference_mode():  # it holds values of the critic before this update
                 self._last.update_(self.env.get_observations())
         return losses
 
@@ -239,11 +239,11 @@ class PackingPPO:
             new = ppo.actor.output_distribution_params
             return float(ppo.actor.get_kl_divergence(old, new).mean())
 
-    # --- what else the runner needs ---------------------------------------------------------------
+    # --- other methods that the runner calls ------------------------------------------------------
 
     @property
     def learning_rate(self) -> float:
-        """Learning rate of the first learner; each learner's own is among the losses."""
+        """Learning rate of the first learner; the losses contain those of all learners."""
         return float(next(iter(self.learners.values())).learning_rate)
 
     @property
@@ -252,7 +252,7 @@ class PackingPPO:
         return torch.cat([ppo.actor.output_std for ppo in self.learners.values()])
 
     def get_policy(self) -> PackingPPO:
-        """Return the algorithm itself, as there is more than one actor."""
+        """Return the algorithm itself, because there is more than one actor."""
         return self
 
     def train_mode(self) -> None:
@@ -274,7 +274,7 @@ class PackingPPO:
                 torch.distributed.broadcast(weight, src=0)
 
     def save(self) -> dict[str, Any]:
-        """Return the stock states of the learners' PPOs, by name, and what else the run owns."""
+        """Return the states of the learners' PPOs, the schedule and the critic of afterstates."""
         state: dict[str, Any] = {
             "learners": {name: ppo.save() for name, ppo in self.learners.items()},
             "schedule_iteration": self.iteration,
@@ -287,7 +287,7 @@ class PackingPPO:
     def load(
         self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool
     ) -> bool:
-        """Load what :meth:`save` returned; return whether the iteration is to be loaded too."""
+        """Load a state from :meth:`save`; return whether to load the iteration too."""
         load_iteration = True
         for name, ppo in self.learners.items():
             load_iteration = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
@@ -298,7 +298,7 @@ class PackingPPO:
         return load_iteration
 
     def load_afterstate_critic(self, weights: Mapping[str, Tensor]) -> None:
-        """Load weights of the critic of afterstates, if agents see its values."""
+        """Load weights of the critic of afterstates, if agents observe its values."""
         if self.afterstates is not None:
             self.afterstates.critic.load_state_dict(weights)
             self.lookahead.forget_values()
@@ -310,16 +310,17 @@ class PackingPPO:
         """Build the algorithm from the runner's configuration.
 
         Args:
-            obs: an observation.
+            obs: an example of an observation.
             env: the games.
-            cfg: ``algorithm`` with ``iterations``, ``lookahead``, and ``frozen`` and ``teachers``:
-                agents by name, callables as :class:`Seat` takes them; ``agents``: for each learner
-                ``network``, ``algorithm`` (rsl_rl's PPO), ``schedule`` and ``teacher_iterations``.
-            device: of the networks.
+            cfg: the configuration. ``algorithm`` has ``iterations``, ``lookahead``, ``frozen`` and
+                ``teachers`` (both: agents by name, callables as in :class:`Seat`). ``agents`` has
+                for each learner ``network``, ``algorithm`` (settings of rsl_rl's PPO), ``schedule``
+                and ``teacher_iterations``.
+            device: the device of the networks.
         """
-        own = cfg["algorithm"]
-        lookahead: Lookahead = own.pop("lookahead")
-        frozen, teachers = own.pop("frozen"), own.pop("teachers")
+        algorithm = cfg["algorithm"]
+        lookahead: Lookahead = algorithm.pop("lookahead")
+        frozen, teachers = algorithm.pop("frozen"), algorithm.pop("teachers")
         seats = []
         for name, settings in cfg["agents"].items():
             kind = AGENT_KINDS[name]
@@ -346,7 +347,7 @@ class PackingPPO:
             afterstates = AfterstateLearner(
                 lookahead.critic, lookahead, cfg["num_steps_per_env"], env.num_envs
             )
-        return PackingPPO(seats, env, lookahead, own["iterations"], afterstates)
+        return PackingPPO(seats, env, lookahead, algorithm["iterations"], afterstates)
 
 
 def _stock_ppo(
@@ -357,7 +358,7 @@ def _stock_ppo(
     cfg: dict[str, Any],
     device: str,
 ) -> PPO:
-    """Build rsl_rl's own PPO with the actor and critic of an agent."""
+    """Build rsl_rl's PPO with the actor and the critic of one agent."""
     network = dict(settings["network"])
     model = {"agent": name, "network": network}
     agent_cfg = {

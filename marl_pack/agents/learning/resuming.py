@@ -1,4 +1,4 @@
-"""Check what a run resumes from: the states of optimisers and of the random generator."""
+"""Check the state from which a run resumes: counters, optimisers and the random generator."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def check_progress(checkpoint: Mapping[str, Any], items: int) -> None:
     """Refuse a checkpoint whose counters do not belong to one point of a run.
 
     Args:
-        checkpoint: to resume from.
-        items: of each iteration, in all processes.
+        checkpoint: the checkpoint to resume from.
+        items: number of items in each iteration, of all processes.
 
     Raises:
-        ValueError: naming the counter and what it needs to be.
+        ValueError: the message names the wrong counter and says what it needs to be.
     """
     done = checkpoint["iter"] + 1
     for key, needed in (("schedule_iteration", done), ("items", done * items)):
@@ -39,34 +39,34 @@ def check_progress(checkpoint: Mapping[str, Any], items: int) -> None:
 def checked_optimizer(
     state: Mapping[str, Any], optimizer: Optimizer, where: str, begun: bool
 ) -> dict[str, Any]:
-    """Return an optimiser's state that another one with the same settings may load.
+    """Return an optimiser's state after checking that ``optimizer`` may load it.
 
-    Only the learning rate changes during a run. Settings that other versions of torch do not write
-    are the optimiser's own.
+    Only the learning rate changes during a run, so all other settings must be equal. Settings that
+    the state lacks, because another version of torch wrote it, are those of ``optimizer``.
 
     Args:
-        state: a ``state_dict``.
-        optimizer: to load it.
-        where: names the state, for messages.
-        begun: whether it has learned, so that there are moments.
+        state: the ``state_dict`` to check.
+        optimizer: the optimiser that will load it.
+        where: name of the state, for messages.
+        begun: whether the optimiser has made a step, so that it must have moments.
 
     Raises:
-        ValueError: naming the first value that the optimiser would not have written.
+        ValueError: the message names the first value that ``optimizer`` would not have written.
     """
-    own = optimizer.state_dict()["param_groups"]
+    expected = optimizer.state_dict()["param_groups"]
     check_keys(state, ["state", "param_groups"], where)
-    if len(state["param_groups"]) != len(own):
-        raise ValueError(f"{where}.param_groups: needs {len(own)}")
+    if len(state["param_groups"]) != len(expected):
+        raise ValueError(f"{where}.param_groups: needs {len(expected)}")
     groups = []
-    for k, (group, ours) in enumerate(zip(state["param_groups"], own, strict=True)):
+    for k, (group, needed) in enumerate(zip(state["param_groups"], expected, strict=True)):
         name = f"{where}.param_groups.{k}"
         if real_number(group.get("lr"), f"{name}.lr") < 0:
             raise ValueError(f"{name}.lr = {group['lr']}: needs 0 or more")
         for key, value in group.items():
-            if key != "lr" and (key not in ours or not _equal(value, ours[key])):
-                needs = shown(ours[key]) if key in ours else "none"
+            if key != "lr" and (key not in needed or not _equal(value, needed[key])):
+                needs = shown(needed[key]) if key in needed else "none"
                 raise ValueError(f"{name}.{key}: is {shown(value)}, needs {needs}")
-        groups.append(ours | {"lr": group["lr"]})
+        groups.append(needed | {"lr": group["lr"]})
     moments = state["state"]
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     if moments or (begun and _after_a_step(optimizer, weights[0])):
@@ -81,7 +81,7 @@ def checked_optimizer(
 
 
 def _equal(value: Any, own: Any) -> bool:
-    """Return whether two settings are equal and of one kind; a list is a tuple."""
+    """Return whether two settings are equal and of the same kind; lists count as tuples."""
     if isinstance(own, list | tuple):
         return (
             isinstance(value, list | tuple)
@@ -94,7 +94,7 @@ def _equal(value: Any, own: Any) -> bool:
 
 
 def _after_a_step(optimizer: Optimizer, weight: Tensor) -> dict[str, Any]:
-    """Return what an optimiser stores for a weight, without memory for its values."""
+    """Return the state of an optimiser for a weight, as tensors without memory for numbers."""
     number = torch.nn.Parameter(torch.zeros((), device="cpu"))
     number.grad = torch.zeros(())
     small = type(optimizer)([number], **optimizer.defaults)
@@ -109,16 +109,16 @@ def _after_a_step(optimizer: Optimizer, weight: Tensor) -> dict[str, Any]:
 def check_generator(state: Tensor, where: str) -> None:
     """Refuse a state of torch's random generator on the CPU that points beyond its own words.
 
-    torch checks the rest as it loads it. The state begins with the seed (8 bytes), the number of
-    words left (4), whether there was a seed (4), and the index of the next word (8).
+    torch checks the rest when it loads the state. The state begins with the seed (8 bytes), the
+    number of words left (4), whether there was a seed (4), and the index of the next word (8).
 
     Raises:
-        ValueError: naming the state.
+        ValueError: the message names the state.
     """
     content = state.cpu().numpy().tobytes()
     left, seeded = np.frombuffer(content, np.int32, 2, 8)
-    following = int(np.frombuffer(content, np.uint64, 1, 16)[0])
-    fresh = (left, following) == (1, 0)
-    running = 1 <= left <= TWISTER_WORDS and left + following == TWISTER_WORDS + 1
+    next_word = int(np.frombuffer(content, np.uint64, 1, 16)[0])
+    fresh = (left, next_word) == (1, 0)
+    running = 1 <= left <= TWISTER_WORDS and left + next_word == TWISTER_WORDS + 1
     if seeded != 1 or not (fresh or running):
         raise ValueError(f"{where}: no state of the random generator")

@@ -1,7 +1,7 @@
 """The runner of a training run: rsl_rl's ``OnPolicyRunner`` with exact resuming and evaluation.
 
 The training loop, the optimisation and the scalars are rsl_rl's own. Evaluations and checkpoints
-are added once an iteration, after rsl_rl has logged it.
+are added after each iteration, when rsl_rl has logged it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these play the same sequences
 LONGEST_RUN = 10**9
-"""Seconds that a run takes at most; TensorBoard numbers its events by them."""
+"""Longest time of a run, in seconds; TensorBoard numbers its events by seconds."""
 LOGGER_STATE = ("tot_timesteps", "tot_time", "cur_reward_sum", "cur_episode_length")
 LOGGER_BUFFERS = ("rewbuffer", "lenbuffer")
 
@@ -45,23 +45,23 @@ class RunInterruptedError(Exception):
 
 
 class TrainingDivergedError(Exception):
-    """A loss is not finite any more; the last checkpoint is as it was."""
+    """A loss or a weight is not finite any more; the last checkpoint is unchanged."""
 
 
 class Runner(OnPolicyRunner):
-    """Trains the agents of :class:`marl_pack.agents.learning.ppo.PackingPPO`.
+    """A runner that trains the agents of :class:`marl_pack.agents.learning.ppo.PackingPPO`.
 
     Args:
         env: the games.
-        train_cfg: as rsl_rl's runner takes it, with ``agents`` and ``algorithm`` as
-            :meth:`PackingPPO.construct_algorithm` says, and ``latest_every``, ``evaluate_every``:
+        train_cfg: the configuration of rsl_rl's runner, with ``agents`` and ``algorithm`` as in
+            :meth:`PackingPPO.construct_algorithm`, and ``latest_every`` and ``evaluate_every``: the
             iterations between checkpoints and between evaluations (0: none).
-        log_dir: the run's folder; None: no logs and no checkpoints.
-        device: of everything.
+        log_dir: the run's folder; None for no logs and no checkpoints.
+        device: the device of games and networks.
         config: the run's settings, stored in the checkpoints.
-        evaluate: a checkpoint → figures of its policy, ``utilization`` among them.
-        show: is called with the figures of each iteration.
-        evaluated: is called after each evaluation, with the history up to it.
+        evaluate: checkpoint → figures of its policy, with ``utilization``.
+        show: called with the figures of each iteration.
+        evaluated: called after each evaluation with the history of all evaluations.
     """
 
     alg: PackingPPO
@@ -98,22 +98,22 @@ class Runner(OnPolicyRunner):
         }
 
     def train(self, iterations: int) -> None:
-        """Train until the run has done ``iterations`` in all.
+        """Train until the run has done ``iterations`` iterations in total.
 
         Raises:
             RunInterruptedError: if :attr:`stop_requested` was set; a checkpoint has been written.
         """
         self.last_iteration = iterations - 1
         remaining = iterations - self.current_learning_iteration
-        self.current_learning_iteration -= 1  # the one last done
+        self.current_learning_iteration -= 1  # the last that is done
         self._write_latest()  # from now on the run can be resumed
         self.current_learning_iteration += 1
         if remaining > 0:
             self.learn(remaining)
-            self.current_learning_iteration += 1  # rsl_rl would repeat the last one
+            self.current_learning_iteration += 1  # rsl_rl would repeat the last
 
     def _after_iteration(self, progress: Progress) -> None:
-        """Show the iteration; evaluate, write a checkpoint and stop where that is due."""
+        """Show the iteration; evaluate, write a checkpoint and stop if it is time to."""
         self.current_learning_iteration = it = progress.iteration - 1
         self.show(progress)
         not_finite = [key for key, value in progress.losses.items() if not math.isfinite(value)]
@@ -121,7 +121,7 @@ class Runner(OnPolicyRunner):
         if not_finite:
             raise TrainingDivergedError(
                 f"training diverged in iteration {progress.iteration}: {', '.join(not_finite)} not "
-                "finite; the last checkpoint is as it was; try a smaller learning rate"
+                "finite; the last checkpoint is unchanged; try a smaller learning rate"
             )
         final = it == self.last_iteration
         every = self.cfg["evaluate_every"] if self.folder is not None else 0
@@ -134,7 +134,7 @@ class Runner(OnPolicyRunner):
             raise RunInterruptedError
 
     def _agents_with_weights_not_finite(self) -> list[str]:
-        """Return the weights that are not finite, as ``name/weights`` of their learners."""
+        """Return ``NAME/weights`` for each network whose weights are not all finite."""
         weights = {
             name: [*ppo.actor.parameters(), *ppo.critic.parameters()]
             for name, ppo in self.alg.learners.items()
@@ -143,8 +143,8 @@ class Runner(OnPolicyRunner):
             weights["afterstate_critic"] = list(self.alg.afterstates.critic.parameters())
         return [
             f"{name}/weights"
-            for name, own in weights.items()
-            if not torch.stack([weight.isfinite().all() for weight in own]).all()
+            for name, parameters in weights.items()
+            if not torch.stack([weight.isfinite().all() for weight in parameters]).all()
         ]
 
     def _write_latest(self) -> None:
@@ -159,7 +159,7 @@ class Runner(OnPolicyRunner):
             )
 
     def _evaluate(self, progress: Progress) -> None:
-        """Add a row to the history; store the checkpoint as best if it is."""
+        """Evaluate the policy and add a row to the history; store the best checkpoint so far."""
         if self.gpu_global_rank != 0:
             return
         start = time.perf_counter()
@@ -187,7 +187,7 @@ class Runner(OnPolicyRunner):
     # --- checkpoints ------------------------------------------------------------------------------
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return what a checkpoint holds: settings, networks and progress."""
+        """Return the content of a checkpoint: settings, networks and progress."""
         algorithm = self.alg.save()
         learned = {
             name: {"network": dict(self.cfg["agents"][name]["network"]), **state}
@@ -210,7 +210,7 @@ class Runner(OnPolicyRunner):
         }
 
     def state(self) -> dict[str, Any]:
-        """Return what else this process needs to resume exactly where it stopped."""
+        """Return the other state that this process needs to resume exactly where it stopped."""
         random: dict[str, Tensor] = {"cpu": torch.get_rng_state()}
         if torch.device(self.device).type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
@@ -248,14 +248,14 @@ class Runner(OnPolicyRunner):
         return infos
 
     def begin_with(self, checkpoint: Mapping[str, Any]) -> None:
-        """Load the learners' weights from another run, and nothing else of it.
+        """Load only the weights of another run: of its learners and critic of afterstates.
 
         Args:
             checkpoint: as :func:`marl_pack.agents.learning.checkpoint.read` returns it.
 
         Raises:
-            ValueError: if an agent that learns here did not learn there, or its network differs. It
-                may see more planes here, with weights of 0 at first.
+            ValueError: if an agent that learns here did not learn there, or its network differs. A
+                network may have more planes here; their weights are 0 at first.
         """
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
@@ -270,15 +270,15 @@ class Runner(OnPolicyRunner):
             needed = asdict(new) | ({"planes": old.planes} if more else {})
             if other := {key: v for key, v in asdict(old).items() if needed[key] != v}:
                 raise ValueError(
-                    f"init: the checkpoint's {name} agent has another network: {other}; begin with "
-                    "the same, or one that sees more planes (--config with the settings of its run)"
+                    f"init: the checkpoint's {name} agent has another network: {other}; use "
+                    "the same, or one with more planes (--config with the settings of its run)"
                 )
             for part in ("actor", "critic"):
                 weights = agent[f"{part}_state_dict"]
                 orientations = AGENT_KINDS[name].orientations
                 getattr(ppo, part).load_state_dict(widen(weights, old, new, orientations))
         if "afterstate_critic" in checkpoint and self.alg.afterstates is not None:
-            # Else it has new weights.
+            # Otherwise the critic keeps its new weights.
             weights = checkpoint["afterstate_critic"]
             own_critic = self.alg.afterstates.critic.state_dict()
             check_alike(weights, own_critic, "init: afterstate_critic")
@@ -301,39 +301,40 @@ class Runner(OnPolicyRunner):
             raise ValueError(f"this run cannot be resumed: {states}")
         if len(states) != self.gpu_world_size:
             raise ValueError(
-                f"{self.gpu_world_size} processes: the run needs {len(states)}, as it had"
+                f"{self.gpu_world_size} processes: the run needs {len(states)}, as before"
             )
-        own = states[self.gpu_global_rank]
+        process_state = states[self.gpu_global_rank]
         try:
-            loaded = self._checked(checkpoint, own)
+            loaded = self._checked(checkpoint, process_state)
             self.alg.load(loaded | {"learners": loaded["agents"]}, None, True)
             if self.alg.afterstates is not None:
-                self.alg.afterstates.load_state_dict(own["afterstates"])
+                self.alg.afterstates.load_state_dict(process_state["afterstates"])
         except ValueError as error:
             raise ValueError(f"the checkpoint does not match its own settings: {error}") from None
         self.current_learning_iteration = checkpoint["iter"] + 1
         self.evaluations = list(checkpoint["evaluations"])
-        self.env.game.load_state_dict(own["game"])
+        self.env.game.load_state_dict(process_state["game"])
         for name in LOGGER_STATE:
-            value = own["logger"][name]
+            value = process_state["logger"][name]
             setattr(self.logger, name, value.to(self.device) if torch.is_tensor(value) else value)
         for name in LOGGER_BUFFERS:
-            getattr(self.logger, name).extend(own["logger"][name])
-        torch.set_rng_state(own["random"]["cpu"].cpu())
-        if "cuda" in own["random"]:
-            torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), self.device)
+            getattr(self.logger, name).extend(process_state["logger"][name])
+        torch.set_rng_state(process_state["random"]["cpu"].cpu())
+        if "cuda" in process_state["random"]:
+            torch.cuda.set_rng_state(process_state["random"]["cuda"].cpu(), self.device)
 
     def _checked(self, checkpoint: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a checkpoint that this run may continue, the optimisers' settings this run's own.
+        """Check that this run may continue a checkpoint, and return it.
 
-        The game and the critic's rollouts check their own parts as they load them.
+        Its optimisers' settings are replaced by those of this run. The game and the learner of the
+        critic of afterstates check their own states when they load them.
 
         Args:
             checkpoint: as for :meth:`resume`.
-            state: this process's, of the checkpoint's.
+            state: the state of this process in the checkpoint.
 
         Raises:
-            ValueError: naming the first value that this run would not have written.
+            ValueError: the message names the first value that this run would not have written.
         """
         expected = self.checkpoint() | {"state": self.state()}
         loaded = dict(checkpoint) | {"state": state}
@@ -359,20 +360,20 @@ class Runner(OnPolicyRunner):
         return self._checked_learners(loaded)
 
     def _checked_learners(self, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a checkpoint whose networks and optimisers this run may load.
+        """Check that this run may load a checkpoint's networks and optimisers, and return it.
 
-        Args, Raises: as for :meth:`_checked`.
+        Its optimisers' settings are replaced by those of this run. Errors: see :meth:`_checked`.
         """
         expected, begun = self.checkpoint(), checkpoint["iter"] >= 0
         loaded = dict(checkpoint) | {"agents": dict(checkpoint["agents"])}
         check_keys(loaded, list(expected), "", also=list(loaded))
         for name, ppo in self.alg.learners.items():
             where = f"agents.{name}"
-            record, own = checkpoints.agent_of(loaded, name), expected["agents"][name]
-            parts = [part for part in own if part != "teacher"]
+            record, needed = checkpoints.agent_of(loaded, name), expected["agents"][name]
+            parts = [part for part in needed if part != "teacher"]
             check_keys(record, parts, where, also=("teacher",))
-            if checkpoints.check_weights(record, name) != Network(**own["network"]):
-                raise ValueError(f"{where}.network: is not that of config.{name}")
+            if checkpoints.check_weights(record, name) != Network(**needed["network"]):
+                raise ValueError(f"{where}.network: differs from the network in config.{name}")
             optimizer = checked_optimizer(
                 record["optimizer_state_dict"],
                 ppo.optimizer,
@@ -388,7 +389,7 @@ class Runner(OnPolicyRunner):
         return loaded
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
-        """Return the current policy, in which each agent takes its most probable action."""
+        """Return the current policy; each learner takes its most probable action."""
         agents = [
             LearnedAgent(seat.kind.name, seat.ppo.actor, self.alg.lookahead)
             if seat.ppo is not None
@@ -407,10 +408,10 @@ class Runner(OnPolicyRunner):
         return play
 
     def export_policy_to_onnx(self, path: str, *args: Any, **named: Any) -> None:
-        """Refuse to export: rsl_rl's exporter knows neither several policies nor masks.
+        """Refuse to export: rsl_rl's exporter supports neither several policies nor masks.
 
         Raises:
-            NotImplementedError: always; ``python -m marl_pack.export`` writes the agents.
+            NotImplementedError: always; ``python -m marl_pack.export`` exports the agents.
         """
         raise NotImplementedError("use python -m marl_pack.export on a checkpoint")
 
@@ -419,7 +420,7 @@ class Runner(OnPolicyRunner):
     # --- several processes ------------------------------------------------------------------------
 
     def _configure_multi_gpu(self) -> None:
-        """Set up the processes as rsl_rl does; those on the CPU communicate through gloo."""
+        """Set up the processes as rsl_rl does; processes on the CPU communicate through gloo."""
         world = int(os.environ.get("WORLD_SIZE", "1"))
         if world == 1 or torch.device(self.device).type != "cpu":
             super()._configure_multi_gpu()
@@ -441,7 +442,7 @@ class Runner(OnPolicyRunner):
         return bool(votes)
 
     def _gather(self, state: dict[str, Any]) -> list[dict[str, Any]] | None:
-        """Return the states of all processes; only the first one receives them."""
+        """Return the states of all processes, in the first process only."""
         if not self.is_distributed:
             return [state]
         states: list[Any] = [None] * self.gpu_world_size

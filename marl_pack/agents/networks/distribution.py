@@ -7,24 +7,24 @@ from rsl_rl.modules.distribution import Distribution
 from torch import Tensor, nn
 
 FORBIDDEN = -1e9
-"""Logit of an illegal action: finite, so that entropy and KL are; its probability is exactly 0."""
+"""Logit of an illegal action. It is finite, so entropy and KL are finite; its probability is 0."""
 
 LARGEST = 1e8
-"""Logits are kept within ± this, well above :data:`FORBIDDEN`."""
+"""Largest absolute value of logits, so that legal ones stay well above :data:`FORBIDDEN`."""
 
 
 class NotFiniteError(ValueError):
-    """The outputs of a network are no numbers, as its weights are too large."""
+    """A network returns NaN because its weights are too large."""
 
 
 def check_outputs(outputs: Tensor) -> None:
-    """Refuse to choose an action by outputs that are not numbers.
+    """Refuse outputs of a network that are not numbers.
 
     Raises:
-        NotFiniteError: if one is NaN.
+        NotFiniteError: if an output is NaN.
     """
     if bool(outputs.isnan().any()):
-        raise NotFiniteError("an agent's network gives no numbers: its weights are too large")
+        raise NotFiniteError("an agent's network returns NaN: its weights are too large")
 
 
 class MaskedCategorical(Distribution):
@@ -34,7 +34,7 @@ class MaskedCategorical(Distribution):
     whole numbers as float [B, 1], as rsl_rl stores them.
 
     Args:
-        output_dim: not used, as K comes from the logits and one network serves every bin size.
+        output_dim: not used: K comes from the logits, as one network plays on every bin size.
     """
 
     mask: Tensor | None = None  # bool [B, K], true where legal
@@ -45,12 +45,12 @@ class MaskedCategorical(Distribution):
 
     @property
     def input_dim(self) -> int:
-        """Number of logits that the head makes for each action: one."""
+        """Number of logits that the head returns for each action: one."""
         return self.output_dim
 
     def masked(self, logits: Tensor) -> Tensor:
         """Return the logits [B, K] with illegal ones at :data:`FORBIDDEN`, float32."""
-        logits = logits.float().clamp(-LARGEST, LARGEST)  # else a huge one could pass the mask
+        logits = logits.float().clamp(-LARGEST, LARGEST)  # a huge logit could pass the mask
         return logits if self.mask is None else torch.where(self.mask, logits, FORBIDDEN)
 
     def update(self, mlp_output: Tensor) -> None:
@@ -72,7 +72,7 @@ class MaskedCategorical(Distribution):
         return torch.where(possible, drawn, best).to(total.dtype)
 
     def deterministic_output(self, mlp_output: Tensor) -> Tensor:
-        """Return the most probable action of each row (the first of equals), float [B, 1].
+        """Return the most probable action of each row (the first of equal ones), [B, 1].
 
         Raises:
             NotFiniteError: if a logit is NaN.
@@ -81,10 +81,10 @@ class MaskedCategorical(Distribution):
         return self.masked(mlp_output).argmax(-1, keepdim=True).float()
 
     def as_deterministic_output_module(self) -> nn.Module:
-        """Refuse to export: the mask is an input, which rsl_rl's exporters do not know.
+        """Refuse to export: rsl_rl's exporters cannot handle the mask, which is an input.
 
         Raises:
-            NotImplementedError: ``python -m marl_pack.export`` writes the agents with their masks.
+            NotImplementedError: always; ``python -m marl_pack.export`` exports agents with masks.
         """
         raise NotImplementedError("use python -m marl_pack.export, which applies the mask inside")
 
