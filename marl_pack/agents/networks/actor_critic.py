@@ -22,7 +22,8 @@ class Actor(MLPModel):
 
     Args:
         obs: an observation of G games, any mapping of tensors.
-        obs_groups, obs_set, output_dim: as rsl_rl passes them; the network's own shape decides.
+        obs_groups, obs_set: as rsl_rl passes them.
+        output_dim: as rsl_rl passes it; not used, as ``agent`` decides the number of outputs.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         network: fields of :class:`marl_pack.agents.networks.shape.Network`.
     """
@@ -37,7 +38,7 @@ class Actor(MLPModel):
         agent: str,
         network: Mapping[str, Any],
     ) -> None:
-        nn.Module.__init__(self)  # MLPModel's own would build a perceptron for flat observations
+        nn.Module.__init__(self)  # MLPModel.__init__ builds a perceptron for flat observations
         shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
         self.cnns = Trunk(kind.orientations, shape)
@@ -47,7 +48,7 @@ class Actor(MLPModel):
     def get_latent(
         self, obs: Observation, masks: Tensor | None = None, hidden_state: None = None
     ) -> Features:
-        """Compute the features of the cells; hand the action mask to the distribution."""
+        """Compute the features of the cells; give the action mask to the distribution."""
         self.distribution.mask = obs["mask"]
         return self.cnns.store(obs)
 
@@ -79,7 +80,7 @@ class Critic(MLPModel):
         shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
         self.distribution = None
-        # Not registered as a part: its weights belong to the actor's state and parameters.
+        # Not registered as a submodule: its weights belong to the actor's state and parameters.
         self._features = cnns.take
         self.mlp = pooled_head(shape, kind.orientations, output_dim, 1.0)
 

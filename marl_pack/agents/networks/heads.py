@@ -32,7 +32,7 @@ class ScoreMap(nn.Module):
 
     Args:
         network: shape of the network.
-        orientations: A.
+        orientations: number of orientations, A.
     """
 
     def __init__(self, network: Network, orientations: int) -> None:

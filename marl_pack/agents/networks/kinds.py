@@ -1,4 +1,4 @@
-"""The kinds of agents: one record each in :data:`AGENT_KINDS`, and the observation of each."""
+"""The kinds of agents (:data:`AGENT_KINDS`), and what each observes."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Choice = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class AgentKind:
-    """The record of how one kind of agent observes and acts.
+    """A description of how one kind of agent observes and acts.
 
     Args:
-        name: its name in settings, checkpoints and scalars.
-        orientations: A, how many orientations it judges: all six, or the one that was chosen.
-        acts_on_cells: whether its actions are cells (of A orientations: ``o · W · D + cell``), else
-            they are orientations.
-        mask: its legal actions in a turn, bool [G, K].
+        name: the agent's name in settings, checkpoints and logged scalars.
+        orientations: number A of orientations that it judges: 6, or 1 (the chosen orientation).
+        acts_on_cells: true if its actions are cells (in A orientations: ``o · W · D + cell``),
+            false if they are orientations.
+        mask: returns its legal actions in a turn, bool [G, K].
         head: builds the network's head: features → logits [G, K].
-        extend: adds its actions int64 [G] to the choices before.
+        extend: adds its actions int64 [G] to the earlier choices of the turn.
     """
 
     name: str
@@ -76,7 +76,7 @@ AGENT_KINDS: dict[str, AgentKind] = {
 
 ORIENTATION, PLACEMENT, JOINT = AGENT_KINDS
 TWO_AGENTS = (ORIENTATION, PLACEMENT)
-"""The agents that take turns within a step, in their order."""
+"""The two agents that take turns within a step, in order."""
 
 
 def observe(
@@ -92,13 +92,13 @@ def observe(
         kind: name in :data:`AGENT_KINDS`.
         game: the games.
         planes: extra planes, names in :data:`marl_pack.agents.networks.planes.PLANES`.
-        lookahead: what placements leave, and its value.
+        lookahead: computes afterstates and their values.
         orientation: int64 [G], the chosen orientations, for the placement agent.
 
     Returns:
         ``heightmap`` int16 [G, W, D] (a copy), ``item`` int16 [G, 3] (sides w, d, h; along x, y, z
         once an orientation is chosen), ``height`` int16 [G, 1] (H), ``mask`` bool [G, K], the legal
-        actions, and what the planes' records give.
+        actions, and the tensors of the planes.
     """
     sight = Sight(game, lookahead, planes, orientation)
     observation = {

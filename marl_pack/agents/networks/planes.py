@@ -1,14 +1,14 @@
-"""The input planes of the networks: one record each in :data:`PLANES`.
+"""The input planes of the networks: :data:`PLANES` has one record for each plane.
 
-A record says which tensors an observation holds for a plane, and which input channels they become.
-Everything else derives from these records: the settings and their help, the symmetries of the bin,
-the exported files, and networks that get more planes.
+A record says which tensors of an observation belong to a plane, and which input channels they
+become. Everything else is derived from these records: the settings and their help, the symmetries
+of the bin, the exported files, and networks that get more planes.
 
 The shape of a tensor in an observation says what it describes. In [G, W, D] each cell describes a
 column of the bin; in [G, A, W, D] each cell describes a placement with its low corner there, in one
 of the A orientations that the agent judges; [G, 1] is one number for the bin.
 
-The names of the planes are part of the settings, so torch is imported only where it is used.
+The settings need the names of the planes, so this module imports torch only where it is used.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the numbers of one tensor of an observation are.
+    """The meaning of the numbers in one tensor of an observation.
 
     Args:
-        unit: their unit, or the values that they may have.
-        text: what they say, and how they are computed.
+        unit: their unit, or the range of their values.
+        text: what they describe, and how they are computed.
     """
 
     unit: str
@@ -46,11 +46,11 @@ class Plane:
     Args:
         name: its name in settings.
         meaning: its meaning in a few words.
-        observe: a turn → tensors of the observation, by name; planes may share a tensor.
-        tensors: what these tensors mean, by name.
+        observe: view of a turn → tensors of the observation, by name; planes may share a tensor.
+        tensors: the meaning of these tensors, by name.
         channels: number of input channels for A orientations.
-        encode: the observation → input channels, float32 [G, …, W, D] each.
-        needs_critic: whether a critic of afterstates has to be there.
+        encode: observation → input channels, float32 [G, …, W, D] each.
+        needs_critic: whether the plane needs a critic of afterstates.
     """
 
     name: str
@@ -111,7 +111,7 @@ def _encode_afterstate_value(observation: Observation) -> list[Tensor]:
 
 
 ALWAYS_OBSERVED = {
-    "heightmap": Meaning("cells", "height of each column: the top of its highest box, else 0"),
+    "heightmap": Meaning("cells", "height of each column: the top of its highest box; 0 if empty"),
     "item": Meaning(
         "cells",
         "sides w, d, h of the item as it comes; for the placement agent its sides along x, y, z in "
@@ -120,11 +120,11 @@ ALWAYS_OBSERVED = {
     "height": Meaning("cells", "height H of the bin"),
     "mask": Meaning(
         "true or false",
-        "whether each action is legal: an orientation is where it has a legal cell; the others "
-        "have probability 0",
+        "whether each action is legal (an orientation is legal if it has a legal cell); illegal "
+        "actions have probability 0",
     ),
 }
-"""What the tensors of every observation mean, by name."""
+"""The meaning of the tensors that every observation has, by name."""
 
 PLANES: dict[str, Plane] = {
     plane.name: plane
@@ -137,7 +137,7 @@ PLANES: dict[str, Plane] = {
                 "legal_cells": Meaning(
                     "true or false",
                     "whether the item may be placed with its low corner there: it is inside the "
-                    "bin and the stability rule of training says that it stands",
+                    "bin and stable by the rule of training",
                 )
             },
             lambda orientations: orientations,
@@ -150,8 +150,8 @@ PLANES: dict[str, Plane] = {
             {
                 "resting_height": Meaning(
                     "cells",
-                    "highest column of the item's w × d window from there on; H where the window "
-                    "is not inside the bin",
+                    "height of the highest column in the item's w × d window with its low corner "
+                    "there; H where the window is not inside the bin",
                 )
             },
             lambda orientations: orientations,
@@ -174,8 +174,8 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "feasible_cells",
-            "the mean number of cells where the next item may be placed afterwards: 1 for the most "
-            "of all placements, 0 for a fifth less or fewer; and that most itself",
+            "the mean number of cells where the next item could be placed afterwards: 1 for the "
+            "largest number, 0 for a fifth less or fewer; and the largest number itself",
             _observe_feasible_cells,
             {
                 "feasible_cells": Meaning(
@@ -184,7 +184,7 @@ PLANES: dict[str, Plane] = {
                     "this placement, by hull_alpha; 0 where it is not legal",
                 ),
                 "most_feasible_cells": Meaning(
-                    "cells", "largest number of feasible cells of all placements, all orientations"
+                    "cells", "largest feasible_cells of all placements in all orientations"
                 ),
             },
             lambda orientations: orientations + 1,
@@ -210,9 +210,9 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "afterstate_value",
-            "the return that a critic of afterstates expects of each placement, on two scales: 1 "
-            "for the best, 0 for a twentieth of the bin less, or for a two-hundredth less; and the "
-            "best itself",
+            "the return that a critic of afterstates expects from each placement, on two scales: 1 "
+            "for the best placement, 0 for a twentieth or a two-hundredth of the bin less; and the "
+            "best return itself",
             _observe_afterstate_value,
             {
                 "afterstate_value": Meaning(
@@ -242,7 +242,7 @@ PLANES: dict[str, Plane] = {
         ),
         Plane(
             "filled",
-            "the filled share of the bin; if items are cut from the bin, the rest is to come",
+            "the filled share of the bin; if items are cut from a bin, the rest is still to come",
             lambda sight: {"filled": sight.utilization[:, None].float()},
             {"filled": Meaning("0 to 1", "filled share of the bin's volume")},
             lambda orientations: 1,
@@ -256,7 +256,7 @@ PLANES: dict[str, Plane] = {
 def need_critic(planes: Iterable[str]) -> bool:
     """Return whether any of the planes needs a critic of afterstates.
 
-    Unknown names count as no: they are refused where a network is built.
+    Unknown names are ignored here; a network refuses them when it is built.
     """
     return any(name in PLANES and PLANES[name].needs_critic for name in planes)
 
@@ -269,7 +269,7 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
 
     Args:
         observation: ``heightmap`` int [G, W, D], ``item`` int [G, 3], ``height`` int [G, 1] (H),
-            and what the planes' records gave it.
+            and the tensors of the planes.
         planes: names in :data:`PLANES`.
 
     Returns:
@@ -289,6 +289,6 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
 
 
 def channel_names(planes: Sequence[str], orientations: int) -> list[tuple[str, int]]:
-    """List the channels of :func:`input_channels` for A orientations, as (plane, which)."""
+    """List the channels of :func:`input_channels` for A orientations, as (plane, number)."""
     counts = [("paper", 4), *((name, PLANES[name].channels(orientations)) for name in planes)]
     return [(name, k) for name, count in counts for k in range(count)]

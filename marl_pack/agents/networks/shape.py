@@ -1,4 +1,4 @@
-"""The shape of a network, as settings and checkpoints give it."""
+"""The shape of a network, in settings and checkpoints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT_PLANES = (
     "mask", "resting_height", "waste", "feasible_cells", "feasible_probability",
     "afterstate_value", "grounded",
 )  # fmt: skip
-"""The input planes of a network unless others are given: those that learn best on RS."""
+"""The default input planes of a network: with these, agents learn best on RS."""
 
 
 @dataclass
@@ -24,11 +24,11 @@ class Network:
 
     Args:
         channels: feature channels of the convolutional trunk.
-        layers: number of its 3 × 3 convolutions.
-        residual: whether each convolution after the first adds to its input.
-        shortcut: whether the heads see the input channels themselves beside the features.
-        context: whether features pooled over the whole bin are added to every cell's.
-        planes: input planes beside the paper's four channels: any of {planes}.
+        layers: number of 3 × 3 convolutions in the trunk.
+        residual: whether each convolution after the first adds its output to its input.
+        shortcut: whether the heads see the input channels in addition to the features.
+        context: whether features pooled over the whole bin are added to the features of every cell.
+        planes: input planes in addition to the paper's four channels: any of {planes}.
         hidden: units of the hidden layer in the heads that follow pooling.
     """
 

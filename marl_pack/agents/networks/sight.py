@@ -1,4 +1,4 @@
-"""What an agent may look at in a turn of the game."""
+"""The view of a turn of the game, from which observations are made."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Sight:
 
     Args:
         game: the games.
-        lookahead: what placements leave, and its value.
-        planes: names of the planes to make.
-        orientation: int64 [G], once the orientations are chosen; None before.
+        lookahead: computes afterstates and their values.
+        planes: names of the planes to compute.
+        orientation: int64 [G], the chosen orientations; None if they are not chosen yet.
     """
 
     game: Packing
@@ -36,7 +36,7 @@ class Sight:
 
     @cached_property
     def item(self) -> Tensor:
-        """Sides of the item int16 [G, 3]: its own, or along x, y, z in the chosen orientation."""
+        """Sides of the item int16 [G, 3]: as it comes, or along x, y, z once it is oriented."""
         if self.orientation is None:
             return self.game.items.sides
         return self.game.orient(self.orientation, check=False).sides
@@ -54,7 +54,7 @@ class Sight:
 
     @cached_property
     def windows(self) -> tuple[Tensor, Tensor]:
-        """Resting heights int16 and wasted cells int32 [G, A, W, D] (no entries if not needed)."""
+        """Resting heights int16 and wasted cells int32 [G, A, W, D]; no waste if not needed."""
         if self.orientation is None:
             sides = self.game.orient_item(self.game.items).sides
         else:

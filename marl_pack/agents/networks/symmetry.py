@@ -22,20 +22,20 @@ from marl_pack.geometry import oriented
 
 
 def count(width: int, depth: int) -> int:
-    """Count the symmetries of a W × D bin, the one that changes nothing included."""
+    """Count the symmetries of a W × D bin, the identity included."""
     return 8 if width == depth else 4
 
 
 def mean_probabilities(actor: Actor, observation: Observation, agent: str) -> Tensor:
     """Average the probability of each action over the bin's symmetries, float32 [G, K].
 
-    The actor judges the same decision once for each symmetry of the bin. If items have their centre
-    of mass off centre, or o may be chosen but not o ^ 1, a mirrored state is only nearly one of the
-    game. The mask is the game's in every case.
+    The actor judges the same decision once for each symmetry of the bin. If centres of mass are off
+    centre, or an item may take orientation o but not o ^ 1, the mirrored state is only nearly a
+    state of the game. The mask is always the game's mask.
 
     Args:
         actor: the agent's network.
-        observation: of the agent.
+        observation: the agent's observation.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
     """
     mask, item = observation["mask"], observation["item"]
@@ -74,7 +74,7 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     """Apply a symmetry of the bin to the observation of each of B games.
 
     Args:
-        observation: of the agent.
+        observation: the agent's observation.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         symmetry: int64 [B], bits: 1 mirrors x, 2 mirrors y, then 4 exchanges x and y (W = D).
     """
@@ -87,8 +87,8 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     x, y = torch.arange(width, device=device), torch.arange(depth, device=device)
     sides = _judged_sides(item, kind)
 
-    # The maps are read backwards: the new map's cell (x, y) shows an old one's. Undo the exchange
-    # first, then the mirrors.
+    # Each cell (x, y) of a new map takes its value from a cell of the old map. To find that cell,
+    # undo the exchange first, then the mirrors.
     from_x, from_y = _exchanged(
         swap,
         x[None, :, None].expand(size, width, depth),
@@ -102,7 +102,7 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     orientation = torch.arange(kind.orientations, device=device).expand(size, -1)
     if kind.orientations > 1:
         orientation = torch.where(swap[:, None], orientation ^ 1, orientation)
-    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))  # of the old one
+    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))  # before
     wide_x, wide_y = (flip[:, None, None, None] for flip in (flip_x, flip_y))
     old_x = _mirrored(from_x[:, None], side[..., 0, None, None], width, wide_x)
     old_y = _mirrored(from_y[:, None], side[..., 1, None, None], depth, wide_y)
@@ -131,7 +131,7 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
 def mirror_actions(
     actions: Tensor, item: Tensor, shape: Sequence[int], agent: str, symmetry: Tensor
 ) -> Tensor:
-    """Return the actions that place the items in the mirrored places, int64 [B, K].
+    """Return the actions that place the items at the mirrored places, int64 [B, K].
 
     Args:
         actions: int64 [B, K], any number of actions for each game.
@@ -139,7 +139,7 @@ def mirror_actions(
         shape: W and D of the bin that is mirrored.
         agent, symmetry: as for :func:`mirror_observation`.
     """
-    # Actions move forwards: first the mirrors, then the exchange.
+    # Actions move from the old bin to the new one: first the mirrors, then the exchange.
     kind = AGENT_KINDS[agent]
     flip_x, flip_y, swap = (bit[:, None] for bit in _bits(symmetry))
     if not kind.acts_on_cells:
@@ -149,11 +149,11 @@ def mirror_actions(
     orientation, cell = floor.split(actions)
     x, y = floor.corner(cell)
     sides = _judged_sides(item, kind)
-    own = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))
+    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))
     new_x, new_y = _exchanged(
         swap.squeeze(1),
-        _mirrored(x, own[..., 0], width, flip_x),
-        _mirrored(y, own[..., 1], depth, flip_y),
+        _mirrored(x, side[..., 0], width, flip_x),
+        _mirrored(y, side[..., 1], depth, flip_y),
     )
     if kind.orientations > 1:
         orientation = torch.where(swap, orientation ^ 1, orientation)

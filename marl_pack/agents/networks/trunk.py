@@ -1,4 +1,4 @@
-"""The trunk of the networks: input channels of cells in, features of cells out.
+"""The trunk of the networks: it turns the input channels of cells into features of cells.
 
 Everything is convolutional or pooled over the cells, so one network runs on any bin size.
 """
@@ -25,8 +25,8 @@ def count_features(network: Network, orientations: int) -> int:
 
 
 def pool(features: Tensor) -> Tensor:
-    """Return mean and maximum over the cells, [B, 2C] of [B, C, W, D]."""
-    # adaptive_max_pool2d is amax with a backward pass that costs a quarter.
+    """Pool features [B, C, W, D] to their mean and maximum over the cells, [B, 2C]."""
+    # adaptive_max_pool2d computes amax; its backward pass takes a quarter of the time.
     most = nn.functional.adaptive_max_pool2d(features, 1).flatten(1)
     return torch.cat((features.mean((2, 3)), most), 1)
 
@@ -36,7 +36,7 @@ class Features:
 
     Args:
         cells: features, float32 [B, C, W, D].
-        inputs: input channels that the heads see too, float32 [B, P, W, D]; None if they do not.
+        inputs: input channels, float32 [B, P, W, D]; None if the heads do not see them.
     """
 
     def __init__(self, cells: Tensor, inputs: Tensor | None) -> None:
@@ -52,7 +52,7 @@ class Features:
         """The pooled :attr:`whole` (:func:`pool`), computed once for actor and critic."""
         if self.inputs is None:
             return pool(self.cells)
-        # Pooled apart: the inputs need no gradient, and a backward pass through them is costly.
+        # Pooled separately: the inputs need no gradient, and their backward pass would be costly.
         parts = (pool(values).chunk(2, 1) for values in (self.cells, self.inputs))
         return torch.cat([part for both in zip(*parts, strict=True) for part in both], 1)
 
@@ -96,7 +96,7 @@ class Trunk(nn.Module):
         return features
 
     def take(self, observation: Observation) -> Features:
-        """Return the features that :meth:`store` computed of the same object, else new ones."""
+        """Return the features that :meth:`store` computed of this object, or compute them."""
         stored, self._stored = self._stored, None
         if stored is not None and stored[0] is observation:
             return stored[1]
@@ -107,16 +107,16 @@ class Trunk(nn.Module):
 def widen(
     weights: Mapping[str, Tensor], old: Network, new: Network, orientations: int
 ) -> dict[str, Tensor]:
-    """Return an actor's or critic's weights for a network with more planes, whose weights are 0.
+    """Extend the weights of an actor or a critic to a network with more planes; new weights are 0.
 
     Args:
         weights: a state_dict of the network ``old``.
-        old: its shape.
-        new: the same shape with every plane of ``old`` among its own.
+        old: the shape of this network.
+        new: the same shape with more planes, those of ``old`` included.
         orientations: A, how many orientations the agent judges.
 
     Returns:
-        A state_dict of ``new``, which computes what ``old`` does.
+        A state_dict for ``new``, with which it computes the same as ``old``.
     """
     old_names, names = (channel_names(network.planes, orientations) for network in (old, new))
     inputs = torch.tensor([names.index(channel) for channel in old_names])
@@ -124,7 +124,7 @@ def widen(
     if new.shortcut:
         features = torch.cat((features, new.channels + inputs))
     count = count_features(new, orientations)
-    places = {  # of each old input among the new ones, in each layer that sees planes
+    places = {  # position of each old input among the new inputs, in the layers that see planes
         "cnns.convolutions.0.weight": (inputs, len(names)),
         "mlp.scores.weight": (features, count),
         "mlp.1.weight": (torch.cat((features, count + features)), 2 * count),
