@@ -1,4 +1,4 @@
-"""What heuristics know of every placement of the visible items."""
+"""The numbers by which heuristics compare the placements of the visible items."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from marl_pack.geometry import resting_heights_and_waste
 
 
 class Candidates:
-    """Every placement of each visible item, legal or not; tensors broadcast to [G, 6, W, D].
+    """All placements of the visible items, legal or not; tensors broadcast to [G, 6, W, D].
 
     Args:
         game: the games.
-        lookahead: what placements leave.
+        lookahead: computes the afterstates of the placements.
     """
 
     def __init__(self, game: Packing, lookahead: Lookahead) -> None:
@@ -34,28 +34,28 @@ class Candidates:
         )
 
     @cached_property
-    def _both(self) -> tuple[Tensor, Tensor]:
+    def _heights_and_waste(self) -> tuple[Tensor, Tensor]:
         """Resting heights and wasted cells of every placement, computed together."""
         return self._windows(waste=True)
 
     @cached_property
     def z(self) -> Tensor:
         """Resting heights, int64 [G, 6, W, D]."""
-        if "_both" in vars(self):
-            return self._both[0].long()
+        if "_heights_and_waste" in vars(self):
+            return self._heights_and_waste[0].long()
         return self._windows(waste=False)[0].long()
 
     @cached_property
     def waste(self) -> Tensor:
         """Empty cells that would be enclosed below the item, int64 [G, 6, W, D]."""
-        return self._both[1].long()
+        return self._heights_and_waste[1].long()
 
     @cached_property
     def top(self) -> Tensor:
-        """Heights of the item's top, at most H, int64 [G, 6, W, D]."""
+        """Height of the item's top, at most H, int64 [G, 6, W, D]."""
         return (self.z + self.sides[..., 2, None, None]).clamp(max=self.size[2])
 
     @cached_property
     def feasible_cells(self) -> Tensor:
-        """Mean number of cells left for a box that may come, float32 [G, 6, W, D]."""
+        """Mean number of cells where a box that may come next could be placed, float32."""
         return self.lookahead.feasible_cells(self.game)

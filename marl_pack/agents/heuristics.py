@@ -1,7 +1,7 @@
-"""Heuristics, each of which scores every legal placement and takes the lowest score.
+"""Heuristics: each ranks the legal placements by keys and takes the lowest.
 
-All use the same masks as the learned agents, so their packings are as stable. If the keys of two
-placements are equal, the first orientation is taken, then the first cell.
+All use the same masks as the learned agents, so their packings are as stable. If two placements
+have equal keys, the first orientation is taken, then the first cell.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Heuristic:
     """A policy that takes the legal placement with the lowest keys.
 
     Args:
-        keys: the placements' keys.
+        keys: computes the keys of all placements.
     """
 
     keys: Callable[[Candidates], Keys]
@@ -45,8 +45,8 @@ class Heuristic:
 
         Args:
             game: the games.
-            legal: the moves to choose among; all legal ones by default.
-            lookahead: what placements leave; computed if not given.
+            legal: the moves to choose among; all legal moves by default.
+            lookahead: computes the afterstates; a new one by default.
         """
         rank = torch.zeros_like(game.mask, dtype=torch.int64)
         for value, bound in self.keys(Candidates(game, lookahead or Lookahead())):
@@ -64,8 +64,8 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     Args:
         name: a heuristic, or ``random``: uniform among the legal orientations, then uniform among
             the cells of the chosen one.
-        seed: of random play; None draws from torch's global generator.
-        device: of the games.
+        seed: of the random choices; with None they come from torch's global generator.
+        device: the device of the games.
 
     Raises:
         ValueError: for an unknown name or an impossible seed.
@@ -89,9 +89,9 @@ def make_orientation_agent(
 ) -> OrientationAgent:
     """Return the orientation agent called ``name``: a heuristic, ``random`` or ``first``.
 
-    ``first`` leaves the item as it comes (orientation 0), or takes the first orientation that may
-    be chosen if orientation 0 may not. Arguments as :func:`make_policy`; ``lookahead`` is shared
-    with the other agent.
+    ``first`` leaves the item as it comes (orientation 0). If orientation 0 is not legal, it takes
+    the first legal orientation. The arguments are those of :func:`make_policy`, and ``lookahead``,
+    which computes afterstates and may be shared with the other agent.
 
     Raises:
         ValueError: for an unknown name.
@@ -115,7 +115,7 @@ def make_placement_agent(
 ) -> PlacementAgent:
     """Return the placement agent called ``name``: ``random``, or a heuristic in one orientation.
 
-    Arguments as :func:`make_orientation_agent`.
+    The arguments are those of :func:`make_orientation_agent`.
 
     Raises:
         ValueError: for an unknown name.

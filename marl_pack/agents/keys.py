@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from marl_pack.agents.candidates import Candidates
 
 Keys = Sequence[tuple["Tensor", int]]
-"""Whole numbers broadcastable to [G, 6, W, D], each with a bound that is larger; the first key
-decides, the next ones break ties."""
+"""Keys of all placements: whole numbers that broadcast to [G, 6, W, D], each with a larger bound.
+
+The placement with the lowest first key is the best; the next keys break ties."""
 
 
 def dblf(c: Candidates) -> Keys:
@@ -25,8 +26,8 @@ def dblf(c: Candidates) -> Keys:
 def height_min(c: Candidates) -> Keys:
     """Heightmap minimisation (Wang & Hauser 2021): least c · (x + y) + sum of the new heightmap.
 
-    With a small c, as in the paper, the sum decides and x + y breaks ties. As the item's volume is
-    the same everywhere, the sum is least where least space is enclosed.
+    With a small c, as in the paper, the sum decides and x + y breaks ties. The item's volume is the
+    same everywhere, so the sum is least where the item encloses the fewest empty cells.
     """
     width, depth, height = c.size
     return (c.waste, width * depth * height), (c.x + c.y, width + depth)
@@ -39,10 +40,10 @@ def best_fit(c: Candidates) -> Keys:
 
 
 def max_feasible(c: Candidates) -> Keys:
-    """Most feasible cells afterwards (:meth:`Lookahead.feasible_cells`), then top, then x + y.
+    """Most feasible cells after the placement (:meth:`Lookahead.feasible_cells`), then top, x + y.
 
-    Greatest mean number of cells where a box that may come next could be placed, then the lowest
-    top, then the lowest x + y.
+    The first key is the mean number of cells where a box that may come next could be placed. The
+    lowest top, then the lowest x + y break ties.
     """
     width, depth, height = c.size
     most = width * depth * MOST_LENGTHS**3

@@ -1,4 +1,4 @@
-"""An agent that plays by a trained network."""
+"""Agents that choose their actions with a trained network."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from marl_pack.game.packing import Packing
 
 
 class LearnedAgent:
-    """A learned agent, which takes the most probable action of its network.
+    """A learned agent: it takes the most probable action of its network.
 
     Args:
         kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         actor: the network.
-        lookahead: what placements leave, and its value; shared with the other agent.
-        symmetric: whether the network is asked in all symmetries of the bin
+        lookahead: computes afterstates and their values; shared with the other agent.
+        symmetric: whether to average the probabilities over the symmetries of the bin
             (:func:`marl_pack.agents.networks.symmetry.mean_probabilities`).
     """
 
@@ -47,7 +47,7 @@ class LearnedAgent:
         return probabilities
 
     def best(self, observation: Observation) -> Tensor:
-        """Return the most probable action, int64 [G], asking the network once."""
+        """Return the most probable action, int64 [G], from one evaluation of the network."""
         return self.actor(observation).squeeze(1).long()
 
     @torch.inference_mode()
@@ -75,7 +75,7 @@ class JointPolicy:
 
         Args:
             game: the games.
-            moves: to choose among; all legal ones by default.
+            moves: the moves to choose among; all legal moves by default.
         """
         if moves is None:
             return game.floor.split(self.agent(game))

@@ -1,4 +1,4 @@
-"""Load agents and policies by name, from runs' folders and from checkpoints."""
+"""Load agents and policies by name, from a run's folder or from a checkpoint."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from marl_pack.items import GENERATED, Stream, independent, make_stream
 
 
 class Loader:
-    """A loader of agents that play together and share what is computed once a turn.
+    """A loader of agents that play together and share the results that are computed once a turn.
 
     Args:
-        device: of the games.
-        seed: of agents that play at random; None draws from torch's global generator.
-        symmetric: whether learned agents are asked in all symmetries of the bin.
-        memo: stores what is computed once a turn.
+        device: the device of the games.
+        seed: of agents that play at random; with None they use torch's global generator.
+        symmetric: whether learned agents average over the symmetries of the bin.
+        memo: stores the results that are computed once a turn; a new one by default.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Loader:
                 ``FILE.py:NAME``, a function of your own.
 
         Raises:
-            ValueError, FileNotFoundError: if it is none of these.
+            ValueError, FileNotFoundError: if ``source`` is none of these.
         """
         if isinstance(source, str) and source in POLICIES:
             return make_policy(source, self.seed, self.device)
@@ -81,7 +81,9 @@ class Loader:
             return self.policy_of(checkpoint)
 
     def orientation_agent(self, source: str) -> OrientationAgent:
-        """Return the orientation agent that ``source`` names; of a joint agent its orientations.
+        """Return the orientation agent that ``source`` names.
+
+        A joint agent chooses cells too; they are ignored.
 
         Raises:
             ValueError, FileNotFoundError: if there is no such agent.
@@ -107,7 +109,7 @@ class Loader:
     # --- from records and checkpoints -------------------------------------------------------------
 
     def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
-        """Return the whole policy of a checkpoint, frozen agents included."""
+        """Return the policy of a checkpoint, its frozen agents included."""
         if JOINT in checkpoint["agents"]:
             return JointPolicy(self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT))
         return InTurns(
@@ -116,21 +118,21 @@ class Loader:
         )
 
     def orientation_agent_of(self, record: Mapping[str, Any]) -> OrientationAgent:
-        """Return the orientation agent of a record."""
+        """Return the orientation agent that a record describes."""
         if "name" in record:
             lookahead = self._lookahead(record)
             return make_orientation_agent(record["name"], self.seed, self.device, lookahead)
         return self.learned(record, ORIENTATION)
 
     def placement_agent_of(self, record: Mapping[str, Any]) -> PlacementAgent:
-        """Return the placement agent of a record."""
+        """Return the placement agent that a record describes."""
         if "name" in record:
             lookahead = self._lookahead(record)
             return make_placement_agent(record["name"], self.seed, self.device, lookahead)
         return self.learned(record, PLACEMENT)
 
     def agent_of(self, record: Mapping[str, Any], name: str) -> Callable[..., Tensor]:
-        """Return the orientation or placement agent of a record, by the agent's name."""
+        """Return the agent ``name`` (orientation or placement) that a record describes."""
         makers: dict[str, Callable[[Mapping[str, Any]], Callable[..., Tensor]]] = {
             ORIENTATION: self.orientation_agent_of,
             PLACEMENT: self.placement_agent_of,
@@ -138,7 +140,7 @@ class Loader:
         return makers[name](record)
 
     def learned(self, record: Mapping[str, Any], kind: str) -> LearnedAgent:
-        """Return the learned agent of a record.
+        """Return the learned agent that a record describes.
 
         Raises:
             ValueError: if the agent has no network, or its weights do not match it.
@@ -147,10 +149,10 @@ class Loader:
         return LearnedAgent(kind, actor, self._lookahead(record), self.symmetric)
 
     def _lookahead(self, record: Mapping[str, Any]) -> Lookahead:
-        """Return the lookahead of an agent: agents with the same critic of afterstates share it."""
+        """Return the lookahead of an agent; agents with the same critic of afterstates share it."""
         weights = record.get("afterstate_critic")
-        for own, lookahead in self._lookaheads:
-            if own is weights:
+        for critic_weights, lookahead in self._lookaheads:
+            if critic_weights is weights:
                 return lookahead
         lookahead = Lookahead(load_afterstate_critic(record, self.device), self.memo)
         self._lookaheads.append((weights, lookahead))
@@ -162,12 +164,13 @@ class Loader:
         """Return a policy that searches with the agents of a checkpoint.
 
         Args:
-            checkpoint: of a run.
+            checkpoint: the checkpoint of a run.
             settings: how far to search.
             futures: the stream from which future items are drawn.
 
         Raises:
-            ValueError: unless both agents are learned, and their critic can value a depth if asked.
+            ValueError: if an agent is not learned, or the settings have a depth and the critic does
+                not estimate shares of the bin.
         """
         first, second = (
             self.learned(checkpoints.agent_record(checkpoint, name), name)
@@ -180,7 +183,7 @@ class Loader:
             if (alpha, gamma) != (1, 1):
                 raise ValueError(
                     f"plan: a depth needs agents trained with game.alpha = 1 and ppo.gamma = 1, "
-                    f"whose critic estimates shares of the bin, not {alpha} and {gamma}"
+                    f"not {alpha} and {gamma}: their critic must estimate shares of the bin"
                 )
             critic = load_critic(checkpoint, ORIENTATION, self.device, first.actor)
         return Planner(first, second, critic, settings, futures, self.seed or 0)
@@ -189,12 +192,12 @@ class Loader:
 def imagined_stream(
     checkpoint: Mapping[str, Any], size: Size | None = None, played: Stream | None = None
 ) -> Stream:
-    """Return the stream of items that a search imagines: such as its agents were trained on.
+    """Return the stream of the items that a search imagines, like the items of the training.
 
     Args:
-        checkpoint: of the agents.
-        size: of the bin; by default that of the training.
-        played: the stream to take in place of a file of the training.
+        checkpoint: the checkpoint of the agents.
+        size: W, D and H of the bin; the size in training by default.
+        played: the stream of the games; it is used if the agents were trained on a file.
 
     Raises:
         ValueError: if there is no such stream.
@@ -216,9 +219,9 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
     """Return the network of a learned agent.
 
     Args:
-        record: of the agent (:mod:`marl_pack.agents.learning.checkpoint`).
+        record: the agent's record (:mod:`marl_pack.agents.learning.checkpoint`).
         kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
-        device: of the games.
+        device: the device of the games.
 
     Raises:
         ValueError: if the agent has no network, or its weights do not match it.
@@ -226,7 +229,7 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
     if "network" not in record:
         raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
     checkpoints.check_weights(record, kind)
-    with torch.random.fork_rng(devices=[]):  # a run's random numbers must stay
+    with torch.random.fork_rng(devices=[]):  # not those of a run
         actor = make_actor(kind, record["network"], device)
     actor.load_state_dict(record["actor_state_dict"])
     return actor.eval()
@@ -238,9 +241,9 @@ def load_critic(
     """Return the critic of one agent of a run.
 
     Args:
-        checkpoint: of the run.
+        checkpoint: the checkpoint of the run.
         kind, device: as for :func:`load_actor`.
-        actor: the agent's, whose trunk the critic shares.
+        actor: the agent's actor, whose trunk the critic shares.
 
     Raises:
         ValueError: if the agent has no critic, or its weights do not match its network.
@@ -258,7 +261,7 @@ def load_critic(
 def load_afterstate_critic(
     record: Mapping[str, Any], device: torch.device | str
 ) -> AfterstateCritic | None:
-    """Return the critic of afterstates of a record or a checkpoint, None if it has none.
+    """Return the critic of afterstates in a record or a checkpoint, or None if it has none.
 
     Raises:
         ValueError: if the weights do not match the network.
@@ -285,7 +288,7 @@ def record_of(source: str, name: str) -> dict[str, Any]:
         name: ``orientation`` or ``placement``.
 
     Raises:
-        ValueError, FileNotFoundError: if it is none of these.
+        ValueError, FileNotFoundError: if ``source`` is none of these.
     """
     if source in checkpoints.HEURISTICS[name]:
         return {"name": source}
@@ -300,7 +303,7 @@ def trained_game(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     They are the options of :class:`marl_pack.game.spec.GameSpec`, ``items`` and ``sides``.
 
     Raises:
-        ValueError: if one that every version wrote is missing, or an option is impossible.
+        ValueError: if a setting that every version wrote is missing, or a value is impossible.
     """
     game = checkpoint["config"].get("game", {})
     for key in ("bin", "rule", "items", "sides"):
@@ -313,7 +316,7 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
     """Describe the game that a checkpoint's agents were trained on, and for how many items.
 
     Raises:
-        ValueError: if its settings are not those of a game.
+        ValueError: if its settings do not describe a game.
     """
     game, seed = trained_game(checkpoint), checkpoint["config"].get("seed", "unknown")
     sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
@@ -324,7 +327,7 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
 
 @contextlib.contextmanager
 def _named(source: str | Path) -> Iterator[None]:
-    """Put the name of a source before the errors of what it holds, once."""
+    """Put the name of a source before the message of an error, unless the message has it."""
     try:
         yield
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Load a policy by name, and let it play: many games at once, or the environment turn by turn."""
+"""Load a policy by name and play with it: many games at once, or the environment by turns."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def load(
 
     Args:
         source: a heuristic (:data:`marl_pack.agents.keys.POLICIES`), a published model such
-            as ``"rs"``, the path of a run's folder or a checkpoint (it has a folder or a suffix,
-            as ``"./NAME"`` has), or ``"FILE.py:NAME"``, a function of your own.
-        device: of the games; the environment plays on the CPU.
-        seed: of random play and of the futures that a search imagines; None draws random play from
+            as ``"rs"``, the path of a run's folder or a checkpoint (a path contains a folder or a
+            dot: ``"./NAME"``), or ``"FILE.py:NAME"``, a function of your own.
+        device: the device of the games; the environment plays on the CPU.
+        seed: of random play and of the futures that a search imagines; with None, random play uses
             torch's global generator.
-        symmetric: whether learned agents are asked in all symmetries of the bin.
-        search: how far learned agents search before each placement; None: not at all. They imagine
-            items of the kind that they were trained on.
+        symmetric: whether learned agents average over the symmetries of the bin.
+        search: how far learned agents search before each placement; None for no search. They
+            imagine items like the items of their training.
 
     Raises:
-        ValueError, FileNotFoundError: if there is no such player, or it cannot play so.
+        ValueError, FileNotFoundError: if there is no such player, or it lacks such an option.
     """
     device = check_device(device)
     seed = None if seed is None else whole_number(seed, "seed", 0, LARGEST_SEED)
@@ -54,8 +54,8 @@ def load(
     if source in POLICIES or is_own(source):
         if symmetric or search is not None:
             raise ValueError(f"symmetric, search: need a learned policy, not {source}")
-        own = is_own(source)
-        return Player(own_policy(str(source)) if own else make_policy(str(source), seed, device))
+        name = str(source)
+        return Player(own_policy(name) if is_own(name) else make_policy(name, seed, device))
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
     from marl_pack.agents.loading import Loader, imagined_stream
@@ -78,9 +78,9 @@ class Player:
     """A player of G games of :class:`marl_pack.game.packing.Packing`, or of the environment.
 
     Args:
-        policy: what decides, such as :func:`marl_pack.agents.loading.load` makes it. A function of
-            your own that is asked for the second turn alone is called with the moves to choose
-            among as its second argument.
+        policy: the policy that chooses, such as :meth:`marl_pack.agents.loading.Loader.policy`
+            returns. If a function of your own has to choose the cell alone, it is called with the
+            moves to choose among as its second argument.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -94,14 +94,14 @@ class Player:
     def act(self, env: Any) -> Any:
         """Return the action of the agent whose turn it is, for ``env.step``.
 
-        The placement agent places the item in the orientation that was chosen, by whomever.
+        The placement agent uses the chosen orientation, also if another player chose it.
 
         Args:
-            env: an environment of :mod:`marl_pack.env_aec`, in any wrappers.
+            env: an environment of :mod:`marl_pack.env_aec`, with or without wrappers.
 
         Returns:
-            The action, or None for an agent that has ended; for a parallel environment a dict with
-            the actions that its step needs.
+            The action, or None for an agent whose episode has ended. For a parallel environment, a
+            dict with the actions that its ``step`` needs.
 
         Raises:
             ValueError: for another environment, or if no agent is left to act.
@@ -126,12 +126,12 @@ class _TwoTurns:
     """The two agents of a policy that chooses orientation and cell at once.
 
     Args:
-        policy: it may be given the moves to choose among as a second argument.
+        policy: a policy that also accepts the moves to choose among, as its second argument.
     """
 
     def __init__(self, policy: Any) -> None:
         self.policy = policy
-        self._turn: object = None  # of the game, in which it chose
+        self._turn: object = None  # the game's turn in which the policy chose
         self._choice: Placement
 
     def orientation_agent(self, game: Packing) -> Tensor:
@@ -140,7 +140,7 @@ class _TwoTurns:
         return self._choice[0]
 
     def placement_agent(self, game: Packing, orientation: Tensor) -> Tensor:
-        """Return the cells, int64 [G]: those chosen before if these orientations were."""
+        """Return the cells, int64 [G]; choose again if the orientations have changed."""
         if self._turn is game.turn and torch.equal(self._choice[0], orientation):
             return self._choice[1]
         cell: Tensor = self.policy(game, game.moves.only(orientation))[1]

@@ -16,18 +16,18 @@ Placement = tuple[Tensor, Tensor]
 Policy = Callable[[Packing], Placement]
 """``game -> (orientation, cell)``, legal wherever ``game.alive``.
 
-Networks, heuristics and random play are all of this form, so one loop plays them all."""
+Networks, heuristics and random play all have this form, so one loop plays them all."""
 
 OrientationAgent = Callable[[Packing], Tensor]
-"""``game -> orientation int64 [G]``: the first agent alone."""
+"""``game -> orientation int64 [G]``: the choice of the orientation agent."""
 
 PlacementAgent = Callable[[Packing, Tensor], Tensor]
-"""``(game, orientation int64 [G]) -> cell int64 [G]``: the second agent alone."""
+"""``(game, orientation int64 [G]) -> cell int64 [G]``: the choice of the placement agent."""
 
 
 @dataclass(frozen=True)
 class InTurns:
-    """The policy in which an orientation and a placement agent act in turns.
+    """A policy of two agents: first the orientation agent acts, then the placement agent.
 
     Args:
         orientation_agent, placement_agent: the agents.
@@ -43,11 +43,11 @@ class InTurns:
 
 
 def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Draw one index uniformly from the true entries of each row; 0 where there are none.
+    """Draw one index uniformly from the true entries of each row; 0 if a row has none.
 
     Args:
         mask: bool [G, K].
-        generator: of the random numbers, on the mask's device; torch's global one by default.
+        generator: of random numbers, on the mask's device; torch's global generator by default.
 
     Returns:
         int64 [G].

@@ -25,20 +25,21 @@ from marl_pack.geometry import ORIENTATIONS, oriented
 from marl_pack.items import Stream
 
 AT_ONCE = 1 << 19
-"""Number of cells, about, on the floors of all imagined games that are played at once."""
+"""Approximate number of cells on the floors of all imagined games that are played at once."""
 
 
 class Planner:
     """A policy that searches with two learned agents.
 
     Args:
-        orientation_agent, placement_agent: the agents, with one lookahead. If they are symmetric,
-            they are asked in all symmetries of the bin for the best pairs, but only once in each
-            turn of the imagined games.
-        critic: the orientation agent's; needed with a ``depth``.
-        settings: of the search.
-        futures: the stream of future items, e.g. ``make_stream("rs", …)``; drawn at each decision.
-        seed: of the futures.
+        orientation_agent, placement_agent: the agents, which share one lookahead. If they are
+            symmetric, they average over the symmetries of the bin to propose pairs, but not in
+            the imagined games.
+        critic: the orientation agent's critic; needed with a ``depth``.
+        settings: the settings of the search.
+        futures: the stream from which future items are drawn at each decision, such as
+            ``make_stream("rs", …)``.
+        seed: the seed of the futures.
     """
 
     def __init__(
@@ -54,18 +55,18 @@ class Planner:
             raise ValueError("plan: a depth needs the orientation agent's critic")
         self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
         self.critic, self.settings, self.futures = critic, settings, futures
-        self.seed = -1 - seed  # games have seeds from 0, so real items are never foreseen
+        self.seed = -1 - seed  # games have seeds ≥ 0: the real items stay unknown
 
     @torch.inference_mode()
     def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
         """Return the best pair of every game, by sequential halving (Karnin et al. 2013).
 
-        Each round plays the same number of futures in all. The better half of the pairs goes to the
-        next round, until one is left.
+        Each round plays the same number of futures in total. The better half of the pairs goes to
+        the next round, until one pair is left.
 
         Args:
             game: the games.
-            moves: to choose among; all legal ones by default.
+            moves: the moves to choose among; all legal moves by default.
         """
         best = torch.zeros(game.n, dtype=torch.int64, device=game.device)
         games = game.alive.nonzero().squeeze(1)  # [B]
@@ -91,13 +92,15 @@ class Planner:
     def _sum(
         self, game: Packing, games: Tensor, pairs: Tensor, legal: Tensor, first: int, k: int
     ) -> Tensor:
-        """Sum the results of ``k`` futures, from number ``first`` on, of each legal pair.
+        """Sum the results of each legal pair over ``k`` futures, from number ``first`` on.
 
         Args:
             game: the games.
-            games: int64 [B], which of them.
-            pairs: int64 [B, M].
-            legal: bool [B, M], of which L are true.
+            games: int64 [B], the indices of the games in which to search.
+            pairs: int64 [B, M], the proposed pairs.
+            legal: bool [B, M], whether each pair is legal; L pairs are.
+            first: number of the first future.
+            k: number of futures.
 
         Returns:
             Float64 [L].
@@ -113,13 +116,13 @@ class Planner:
         return torch.cat(values).view(-1, k).sum(1)
 
     def _futures(self, game: Packing, games: Tensor, first: int, k: int) -> Tensor:
-        """Return k numbers of futures for each game, int64 [B, k], from number ``first`` on."""
+        """Return the numbers of k futures of each game, int64 [B, k], from ``first`` on."""
         decision = game.episode[games] * game.bins.boxes.shape[1] + game.t[games]
         numbers = decision * self.settings.top * self.settings.rollouts + first
         return numbers[:, None] + torch.arange(k, device=games.device)
 
     def _propose(self, game: Packing, games: Tensor, moves: Moves) -> tuple[Tensor, Tensor]:
-        """Return the M most probable of the moves in the games [B], and which of them are legal.
+        """Return the M most probable moves in each of the B games, and whether each is legal.
 
         Returns:
             int64 [B, M], and bool [B, M]: false at the end of rows with fewer than M legal pairs.
@@ -139,16 +142,16 @@ class Planner:
         legal = moves.mask[games].flatten(2)
         same = _same_boxes(game)[games].double()
         merged = torch.einsum("noe,nec->noc", same, torch.cat(joint) * legal)
-        before = torch.einsum("noe,nec->noc", same.tril(-1), legal.double())
-        merged = merged.masked_fill(~legal | (before > 0), -1).flatten(1)
+        earlier = torch.einsum("noe,nec->noc", same.tril(-1), legal.double())
+        merged = merged.masked_fill(~legal | (earlier > 0), -1).flatten(1)
         probability, pairs = merged.topk(min(self.settings.top, merged.shape[1]))
         return pairs, probability >= 0
 
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
-        """Play imagined games to their end from pairs; return the filled share of each bin, [G].
+        """Play the pairs and then the imagined games to their end; return the filled shares [G].
 
-        With a depth, each game stops there, and the critic's value is added in place of the rest.
-        It is the return (Eq. 5), so it subtracts the space that may still be wasted.
+        With a depth, each game stops after so many items, and the critic's value is added for the
+        items that may still come. It estimates the return (Eq. 5), which subtracts wasted space.
         """
         value = torch.zeros(game.n, dtype=torch.float64, device=game.device)
         rows = torch.arange(game.n, device=game.device)
@@ -176,7 +179,7 @@ class Planner:
 def _same_boxes(game: Packing) -> Tensor:
     """Return which orientations of the item give the same box, bool [G, 6, 6]."""
     sides = oriented(game.items.sides)
-    if any(game.spec.com_offset):  # then a rotated cube is another box
+    if any(game.spec.com_offset):  # rotating a cube moves its centre of mass
         return torch.eye(len(ORIENTATIONS), dtype=torch.bool, device=sides.device).expand(
             game.n, -1, -1
         )

@@ -1,4 +1,4 @@
-"""The settings of the search at decision time, as ``--plan`` gives them."""
+"""The settings of the search at decision time (``--plan``)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from marl_pack.checks import whole_number
 
 MOST = 1 << 20
-"""Largest number of futures of one decision."""
+"""Largest number of futures in one decision."""
 
 
 @dataclass(frozen=True)
@@ -16,10 +16,10 @@ class SearchSettings:
     """The number of pairs and futures that a search tries, and their depth.
 
     Args:
-        rollouts: imagined futures K for each pair, on average.
-        top: pairs M to be tried.
-        depth: items to be placed in each future before the orientation agent's critic values what
-            may still come; None plays every future to its end.
+        rollouts: number K of imagined futures for each pair, on average.
+        top: number M of pairs to try.
+        depth: number of items to place in each future before the orientation agent's critic
+            estimates the rest; None plays every future to its end.
     """
 
     rollouts: int = 16
@@ -39,10 +39,10 @@ class SearchSettings:
 
     @classmethod
     def parse(cls, text: str) -> SearchSettings:
-        """Read settings such as ``"rollouts=16,top=8,depth=3"``; missing ones have their defaults.
+        """Read settings such as ``"rollouts=16,top=8,depth=3"``; missing settings get defaults.
 
         Raises:
-            ValueError: if the text has another form; says what would be right.
+            ValueError: if the text has another form; the message says which form is needed.
         """
         values = {}
         for part in text.split(","):

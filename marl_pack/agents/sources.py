@@ -1,4 +1,4 @@
-"""Find the files of policies: published models, checkpoints, runs' folders, and code of users."""
+"""Find the files of policies: published models, checkpoints, folders of runs, and your own code."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 from marl_pack import published, renamed
 
 LATEST, BEST = "latest.pt", "best.pt"
-"""Checkpoints in a run's folder: to resume from, and the best of all evaluations."""
+"""Checkpoints in a run's folder: the latest, to resume from, and the best in evaluation."""
 
 
 OWN = re.compile(r"(.+\.py):([A-Za-z_]\w*)")
-"""A policy in code of the user's own, such as ``my_agents.py:policy``."""
+"""The form of a policy in the user's own code, such as ``my_agents.py:policy``."""
 
 
 def is_own(source: object) -> bool:
@@ -39,7 +39,7 @@ def own_policy(source: str) -> Any:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the code of the user raises
+    except Exception as error:  # the user's code may raise anything
         raise ValueError(f"{file}: cannot be run: {type(error).__name__}: {error}") from error
     function = getattr(module, name, None)
     if not callable(function):
@@ -65,10 +65,10 @@ def check_source(source: str, names: Sequence[str]) -> None:
 
     Args:
         source: a heuristic, a published model, a path, or ``FILE.py:NAME``.
-        names: the heuristics that may be given.
+        names: the heuristics that are valid here.
 
     Raises:
-        ValueError, FileNotFoundError: naming what would be right.
+        ValueError, FileNotFoundError: if there is no such policy; the message says what is valid.
     """
     if is_own(source):
         _own_parts(source)
@@ -81,10 +81,10 @@ def path_of(source: str | Path, names: Sequence[str]) -> Path:
 
     Args:
         source: a published model's name, or a path.
-        names: heuristics that may be given in its place, for the message.
+        names: the heuristics that are also valid here, for the message.
 
     Raises:
-        ValueError: if it is no path and no published model's name; says what would be right.
+        ValueError: if ``source`` is neither a path nor the name of a published model.
     """
     renamed.refuse_old(str(source), renamed.POLICIES, "policy")
     return published.model(source, names)
@@ -94,19 +94,19 @@ def resolve(source: str | Path) -> Path:
     """Return the checkpoint file that ``source`` names.
 
     Args:
-        source: a published model's name, or the path of a checkpoint or of a run's folder: there
-            its best, else its latest.
+        source: a published model's name, or the path of a checkpoint or of a run's folder. In a
+            folder, ``best.pt`` is taken; ``latest.pt`` if there is no best.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: for a name that is none of a published model.
+        FileNotFoundError: if there is no such file.
+        ValueError: for a name that no published model has.
     """
     path = published.model(source)
     if path.is_dir():
         for name in (BEST, LATEST):
             if (path / name).is_file():
                 return path / name
-        raise FileNotFoundError(f"{path}: needs {BEST} or {LATEST}, as a run's folder has")
+        raise FileNotFoundError(f"{path}: no run's folder, which has {BEST} or {LATEST}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     return path
