@@ -121,7 +121,7 @@ def test_a_truncated_foreign_or_mismatched_file_is_refused(runs: Path, tmp_path:
         checkpoints.read(path)
     with pytest.raises(FileNotFoundError, match="no such checkpoint"):
         checkpoints.read(tmp_path / "none.pt")
-    with pytest.raises(FileNotFoundError, match=r"needs best\.pt or latest\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"has neither best\.pt nor latest\.pt"):
         checkpoints.read(tmp_path)
     damaged = bytearray(whole)
     damaged[len(whole) // 2] ^= 255

@@ -77,7 +77,7 @@ class Loader:
             policy: Policy = own_policy(source)
             return policy
         checkpoint = checkpoints.read(path_of(source, POLICIES), self.device)
-        with _named(source):
+        with _with_source(source):
             return self.policy_of(checkpoint)
 
     def orientation_agent(self, source: str) -> OrientationAgent:
@@ -91,10 +91,10 @@ class Loader:
         if source not in ORIENTATION_AGENTS:
             checkpoint = checkpoints.read(path_of(source, ORIENTATION_AGENTS), self.device)
             if JOINT in checkpoint["agents"]:
-                with _named(source):
+                with _with_source(source):
                     policy = self.policy_of(checkpoint)
                 return lambda game: policy(game)[0]
-        with _named(source):
+        with _with_source(source):
             return self.orientation_agent_of(record_of(source, ORIENTATION))
 
     def placement_agent(self, source: str) -> PlacementAgent:
@@ -103,7 +103,7 @@ class Loader:
         Raises:
             ValueError, FileNotFoundError: if there is no such agent.
         """
-        with _named(source):
+        with _with_source(source):
             return self.placement_agent_of(record_of(source, PLACEMENT))
 
     # --- from records and checkpoints -------------------------------------------------------------
@@ -229,7 +229,7 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
     if "network" not in record:
         raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
     checkpoints.check_weights(record, kind)
-    with torch.random.fork_rng(devices=[]):  # not those of a run
+    with torch.random.fork_rng(devices=[]):  # a run's random numbers stay the same
         actor = make_actor(kind, record["network"], device)
     actor.load_state_dict(record["actor_state_dict"])
     return actor.eval()
@@ -293,7 +293,7 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     if source in checkpoints.HEURISTICS[name]:
         return {"name": source}
     checkpoint = checkpoints.read(path_of(source, checkpoints.HEURISTICS[name]))
-    with _named(source):
+    with _with_source(source):
         return checkpoints.agent_record(checkpoint, name)
 
 
@@ -326,7 +326,7 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def _named(source: str | Path) -> Iterator[None]:
+def _with_source(source: str | Path) -> Iterator[None]:
     """Put the name of a source before the message of an error, unless the message has it."""
     try:
         yield

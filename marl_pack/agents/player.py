@@ -44,7 +44,7 @@ def load(
             imagine items like the items of their training.
 
     Raises:
-        ValueError, FileNotFoundError: if there is no such player, or it lacks such an option.
+        ValueError, FileNotFoundError: if there is no such player, or it does not support an option.
     """
     device = check_device(device)
     seed = None if seed is None else whole_number(seed, "seed", 0, LARGEST_SEED)

@@ -106,7 +106,7 @@ def resolve(source: str | Path) -> Path:
         for name in (BEST, LATEST):
             if (path / name).is_file():
                 return path / name
-        raise FileNotFoundError(f"{path}: no run's folder, which has {BEST} or {LATEST}")
+        raise FileNotFoundError(f"{path}: not a run's folder: it has neither {BEST} nor {LATEST}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     return path

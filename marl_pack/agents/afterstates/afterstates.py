@@ -183,7 +183,7 @@ def _place_each(
 
 
 @njit(cache=True, nogil=True)
-def _describe(heightmaps: Any, height: int, surface: Any) -> None:
+def _write_surfaces(heightmaps: Any, height: int, surface: Any) -> None:
     """Write the surface of maps int16 [K, W, D] as in :class:`Afterstates`."""
     width, depth = heightmaps.shape[1:]
     columns = np.float32(width * depth)
@@ -289,7 +289,7 @@ def afterstates_by_compiled_loops(
         part = slice(start, start + most)
         maps = np.empty((2, len(placements[part]), *shape), np.int16)
         _place_each(heightmap, empty_map, boxes, placements[part], maps[0], maps[1], waste[part])
-        _describe(maps[0], bins.height, surface[part])
+        _write_surfaces(maps[0], bins.height, surface[part])
         count_cells(maps[0], maps[1], probes, fitting, counts[part])
 
     starts = range(0, count, most)

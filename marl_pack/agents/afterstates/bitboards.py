@@ -72,7 +72,7 @@ def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
 
 @njit(cache=True)
 def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
-    """Find the low corners of the windows up to R × S that contain one of ``cells``.
+    """Find the low corners of windows of each size up to R × S that contain one of ``cells``.
 
     Args:
         cells: uint64 [2], a set.
@@ -244,7 +244,7 @@ def count_by_bits(
                         free_low = valid[i, j, 0] & ~blocked[j, 0]
                         free_high = valid[i, j, 1] & ~blocked[j, 1]
                         if not (free_low | free_high):
-                            last = j  # longer boxes have no free window on this level
+                            last = j  # longer windows are not free on this level either
                             break
                         half_d = (lengths[j] + 1) // 2
                         along = lengths[j] - half_d

@@ -23,7 +23,7 @@ from marl_pack.game.packing import Packing
 
 HIDDEN = 64
 REMEMBERED = 1 << 16
-"""Number of afterstates from the last rollouts from which the critic learns."""
+"""Number of afterstates, from the last rollouts, that the critic learns from."""
 PASSES, MINIBATCH = 16, 512
 """How often the critic learns from each afterstate, on average, and the minibatch size."""
 
@@ -49,7 +49,7 @@ class AfterstateLearner:
     """The learner that fits the critic to the returns of recent placements.
 
     A placement's return is mostly chance, so the critic learns from many placements: about
-    :data:`REMEMBERED` from the last rollouts, since when the agents have changed little.
+    :data:`REMEMBERED` from the last rollouts. The agents have changed little since then.
 
     Args:
         critic: the critic.
@@ -76,7 +76,7 @@ class AfterstateLearner:
         rows = Moves.gather(afterstates.index, orientation, cell)
         position = self.rollouts % self.capacity, self.step
         self.inputs[position] = features(afterstates, game.volume, rows).half()
-        self.legal[position] = Moves.gather(game.mask, orientation, cell)  # else no box
+        self.legal[position] = Moves.gather(game.mask, orientation, cell)  # false: no box
         self.step += 1
 
     def learn(

@@ -233,7 +233,7 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
 def check_weights(record: Mapping[str, Any], name: str) -> Network:
     """Return the shape of an agent's network; refuse weights that do not fit it.
 
-    The network takes no memory, because a damaged file may give it any shape.
+    The check takes no memory for the network, because a damaged file may give it any shape.
 
     Args:
         record: the record of a learned agent, with or without the states of critic and optimiser.

@@ -19,7 +19,7 @@ from marl_pack.checks import TYPE_NAMES, described, shown
 MOST_VALUES, DEEPEST, LONGEST_TEXT = 1 << 18, 32, 4096
 """Limits of a file: number of values, depth of nesting, and characters in a text."""
 LONGEST_NAME = 60
-"""Number of characters up to which a message shows a key as it is."""
+"""Length of the longest key that a message shows as it is."""
 LARGEST_WHOLE = 1 << 64
 """Whole numbers are smaller than this."""
 
@@ -58,7 +58,7 @@ class Plain:
             return self._tensor(value, where)
         if isinstance(value, Mapping):
             return {
-                self._key(key, where): self.copy(item, _below(where, key), depth + 1)
+                self._key(key, where): self.copy(item, _path_to(where, key), depth + 1)
                 for key, item in value.items()
             }
         if type(value) in (list, tuple):
@@ -104,7 +104,7 @@ class Plain:
         return tensor
 
 
-def _below(where: str, key: object) -> str:
+def _path_to(where: str, key: object) -> str:
     """Return the name of the value ``key`` in the value ``where``, for messages."""
     name = key if type(key) is str and len(key) <= LONGEST_NAME else shown(key)
     return f"{where}.{name}" if where else name
@@ -126,7 +126,7 @@ def check_form(value: Any, form: Form, where: str) -> None:
         for key, item in value.items():
             form_of_item = form.get(key, form.get(type(key)))
             if form_of_item is not None:
-                check_form(item, form_of_item, _below(where, key))
+                check_form(item, form_of_item, _path_to(where, key))
             elif str not in form and int in form:
                 raise ValueError(f"{where}: has the key {shown(key)}, needs whole numbers")
     elif isinstance(form, list):
@@ -134,7 +134,7 @@ def check_form(value: Any, form: Form, where: str) -> None:
         if len(form) > 1 and len(value) != len(form):
             raise ValueError(f"{where}: has {len(value)} entries, needs {len(form)}")
         for k, item in enumerate(value):
-            check_form(item, form[k if len(form) > 1 else 0], _below(where, k))
+            check_form(item, form[k if len(form) > 1 else 0], _path_to(where, k))
     else:
         _check_type(value, form, where)
 
@@ -149,10 +149,10 @@ def check_no_tensors(value: Any, where: str) -> None:
         raise ValueError(f"{where}: is a tensor, needs a plain value")
     if isinstance(value, Mapping):
         for key, item in value.items():
-            check_no_tensors(item, _below(where, key))
+            check_no_tensors(item, _path_to(where, key))
     elif isinstance(value, list | tuple):
         for k, item in enumerate(value):
-            check_no_tensors(item, _below(where, k))
+            check_no_tensors(item, _path_to(where, k))
 
 
 def _check_type(value: Any, form: type | tuple[type, ...], where: str) -> None:
@@ -182,7 +182,7 @@ def check_alike(value: Any, own: Any, where: str) -> None:
         _check_type(value, dict, where)
         check_keys(value, list(own), where)
         for key, item in own.items():
-            check_alike(value[key], item, _below(where, key))
+            check_alike(value[key], item, _path_to(where, key))
     else:
         _check_type(value, float if type(own) is int else type(own), where)
 
@@ -197,7 +197,7 @@ def check_keys(
     """
     for key in keys:
         if key not in value:
-            raise ValueError(f"{_below(where, key)} is missing")
+            raise ValueError(f"{_path_to(where, key)} is missing")
     for key in value:
         if key not in keys and key not in also:
-            raise ValueError(f"{_below(where, key)} is unknown")
+            raise ValueError(f"{_path_to(where, key)} is unknown")

@@ -50,7 +50,7 @@ class IterationLogger(Logger):
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict, **others)
         batch = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
-        if self.writer is None:  # rsl_rl counts only in the process that logs
+        if self.writer is None:  # rsl_rl counts only where it logs; all need the same counts
             self.tot_timesteps += batch
             self.tot_time += collect_time + learn_time
         rewards = self.rewbuffer

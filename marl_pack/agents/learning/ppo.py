@@ -216,7 +216,7 @@ class PackingPPO:
             losses[f"{name}/learning_rate"] = ppo.learning_rate
         self.iteration += 1
         if self.afterstates is not None and self._last is not None:
-            with torch.inference_mode():  # it holds values of the critic before this update
+            with torch.inference_mode():  # it has values from before this update
                 self._last.update_(self.env.get_observations())
         return losses
 

@@ -105,7 +105,7 @@ class Runner(OnPolicyRunner):
         """
         self.last_iteration = iterations - 1
         remaining = iterations - self.current_learning_iteration
-        self.current_learning_iteration -= 1  # the last that is done
+        self.current_learning_iteration -= 1  # the last iteration done
         self._write_latest()  # from now on the run can be resumed
         self.current_learning_iteration += 1
         if remaining > 0:
@@ -113,7 +113,7 @@ class Runner(OnPolicyRunner):
             self.current_learning_iteration += 1  # rsl_rl would repeat the last
 
     def _after_iteration(self, progress: Progress) -> None:
-        """Show the iteration; evaluate, write a checkpoint and stop if it is time to."""
+        """Show the iteration; evaluate, write a checkpoint and stop when due."""
         self.current_learning_iteration = it = progress.iteration - 1
         self.show(progress)
         not_finite = [key for key, value in progress.losses.items() if not math.isfinite(value)]
@@ -159,7 +159,7 @@ class Runner(OnPolicyRunner):
             )
 
     def _evaluate(self, progress: Progress) -> None:
-        """Evaluate the policy and add a row to the history; store the best checkpoint so far."""
+        """Evaluate the policy and add a row to the history; store the best checkpoint."""
         if self.gpu_global_rank != 0:
             return
         start = time.perf_counter()
@@ -260,7 +260,7 @@ class Runner(OnPolicyRunner):
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
             if "critic_state_dict" not in agent or "network" not in agent:
-                raise ValueError(f"init: the checkpoint holds no {name} agent that has learned")
+                raise ValueError(f"init: the checkpoint has no {name} agent that has learned")
             try:
                 old = checkpoints.check_weights(agent, name)
             except ValueError as error:
@@ -296,7 +296,7 @@ class Runner(OnPolicyRunner):
         """
         states = checkpoint.get("state")
         if states is None:
-            raise ValueError("this checkpoint holds no state of the game; resume from latest.pt")
+            raise ValueError("this checkpoint has no state of the game; resume from latest.pt")
         if isinstance(states, str):  # the reason why it cannot be resumed
             raise ValueError(f"this run cannot be resumed: {states}")
         if len(states) != self.gpu_world_size:

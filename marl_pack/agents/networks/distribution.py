@@ -50,7 +50,7 @@ class MaskedCategorical(Distribution):
 
     def masked(self, logits: Tensor) -> Tensor:
         """Return the logits [B, K] with illegal ones at :data:`FORBIDDEN`, float32."""
-        logits = logits.float().clamp(-LARGEST, LARGEST)  # a huge logit could pass the mask
+        logits = logits.float().clamp(-LARGEST, LARGEST)  # else a huge logit could pass the mask
         return logits if self.mask is None else torch.where(self.mask, logits, FORBIDDEN)
 
     def update(self, mlp_output: Tensor) -> None:

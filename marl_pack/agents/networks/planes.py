@@ -66,7 +66,7 @@ def _shape(observation: Observation) -> torch.Size:
     return observation["heightmap"].shape[1:]
 
 
-def _everywhere(number: Tensor, shape: torch.Size) -> Tensor:
+def _at_every_cell(number: Tensor, shape: torch.Size) -> Tensor:
     """Repeat a number of each bin [G, 1] at every cell, [G, 1, W, D]."""
     return number[:, :, None, None].expand(-1, 1, *shape)
 
@@ -90,7 +90,7 @@ def _observe_feasible_cells(sight: Sight) -> dict[str, Tensor]:
 def _encode_feasible_cells(observation: Observation) -> list[Tensor]:
     cells, most = observation["feasible_cells"], observation["most_feasible_cells"]
     close = 1 + 5 * (cells.log1p() - most[:, :, None, None].log1p())
-    level = _everywhere(most.log1p() / 4, _shape(observation))
+    level = _at_every_cell(most.log1p() / 4, _shape(observation))
     return [close.clamp(min=0) * (cells > 0), level]
 
 
@@ -107,7 +107,7 @@ def _encode_afterstate_value(observation: Observation) -> list[Tensor]:
     best = observation["best_afterstate_value"]
     behind = observation["afterstate_value"] - best[:, :, None, None]
     near = [(1 + scale * behind).clamp(min=0) for scale in (20, 200)]
-    return [*near, _everywhere(best, _shape(observation))]
+    return [*near, _at_every_cell(best, _shape(observation))]
 
 
 ALWAYS_OBSERVED = {
@@ -246,7 +246,7 @@ PLANES: dict[str, Plane] = {
             lambda sight: {"filled": sight.utilization[:, None].float()},
             {"filled": Meaning("0 to 1", "filled share of the bin's volume")},
             lambda orientations: 1,
-            lambda observation: [_everywhere(observation["filled"], _shape(observation))],
+            lambda observation: [_at_every_cell(observation["filled"], _shape(observation))],
         ),
     )
 }

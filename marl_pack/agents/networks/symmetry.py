@@ -102,7 +102,7 @@ def mirror_observation(observation: Observation, agent: str, symmetry: Tensor) -
     orientation = torch.arange(kind.orientations, device=device).expand(size, -1)
     if kind.orientations > 1:
         orientation = torch.where(swap[:, None], orientation ^ 1, orientation)
-    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))  # before
+    side = sides.long().gather(1, orientation[..., None].expand(-1, -1, 3))  # in the old bin
     wide_x, wide_y = (flip[:, None, None, None] for flip in (flip_x, flip_y))
     old_x = _mirrored(from_x[:, None], side[..., 0, None, None], width, wide_x)
     old_y = _mirrored(from_y[:, None], side[..., 1, None, None], depth, wide_y)
