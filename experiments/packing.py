@@ -65,14 +65,14 @@ TABLES = {
         )
     ],
 }
-KEPT = ROOT / "runs" / "packing"
+PLANS_FOLDER = ROOT / "runs" / "packing"
 """The folder of the plans that are still to be judged."""
 PART = 50
 """Number of packings that are judged before the figures are written again."""
 
 
 def measure(
-    results: Results, key: str, physics: bool, processes: int = 1, kept: Path = KEPT
+    results: Results, key: str, physics: bool, processes: int = 1, plans_folder: Path = PLANS_FOLDER
 ) -> None:
     """Play the policy of a row and judge its packings, unless that is done.
 
@@ -81,7 +81,7 @@ def measure(
         key: the row's options of the command ``evaluate``, without ``--physics``.
         physics: whether to judge the packings.
         processes: number of processes that judge at once.
-        kept: folder of the plans that are still to be judged.
+        plans_folder: folder of the plans that are still to be judged.
     """
     console = make_console()
     options = expanded(key) + ["--physics", "--processes", str(processes)] * physics
@@ -91,8 +91,8 @@ def measure(
     episodes, bodies = evaluate.check_options(arguments, setup)
     command = f"python -m marl_pack.evaluate {key}" + " --physics" * physics
     row = results.rows().get(key)
-    kept.mkdir(parents=True, exist_ok=True)
-    plans_file = kept / f"{re.sub(r'[^A-Za-z0-9.]+', '_', key).strip('_')}.npz"
+    plans_folder.mkdir(parents=True, exist_ok=True)
+    plans_file = plans_folder / f"{re.sub(r'[^A-Za-z0-9.]+', '_', key).strip('_')}.npz"
     with make_progress(console) as bar:
         plans: list[Plan] | None = None
         if row is None or (physics and not plans_file.is_file() and not judged(row)):

@@ -88,7 +88,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.network.planes=[room]"], r"plane 'room' is now called 'feasible_cells'"),
     (["--game.bin=[10,10]"], r"^game\.bin = \[10, 10\]: needs a list of 3 whole numbers, such as "),
     (["--game.bin", "7,5,9"], r"^game\.bin = 7,5,9: needs a list of 3 whole numbers"),
-    (["--seed", "7", "5", "9"], r"^5 9: belongs to no key; a list is one word, such as"),
+    (["--seed", "7", "5", "9"], r"^5 9: no key takes this; a list is one word, such as"),
     (["--game.bin=[10,10,0]"], r"game: bin size \(10, 10, 0\)"),
     (["--ppo.gamma=1.5"], r"ppo\.gamma = 1\.5: needs a number from 0 to 1$"),
     (["--ppo.learning_rate=1e38"], r"ppo\.learning_rate = 1e\+38: needs a positive number, 1e\+30"),

@@ -50,10 +50,10 @@ def test_a_row_of_packings_goes_on_where_its_judgement_was_stopped(
     monkeypatch.setattr(packing, "PART", 5)
     monkeypatch.setattr(packing, "judge_all", killed)
     with pytest.raises(KeyboardInterrupt):
-        packing.measure(results, key, physics=True, kept=tmp_path)
+        packing.measure(results, key, physics=True, plans_folder=tmp_path)
     assert results.row(key)["judged_episodes"] == 5
     monkeypatch.setattr(packing, "judge_all", judge)
-    packing.measure(results, key, physics=True, kept=tmp_path)
+    packing.measure(results, key, physics=True, plans_folder=tmp_path)
     evaluate.main([*key.split(), "--physics", "--json", str(tmp_path / "whole.json")])
     [whole] = json.loads((tmp_path / "whole.json").read_text("utf-8"))["policies"].values()
     row = results.row(key)

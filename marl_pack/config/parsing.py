@@ -184,7 +184,7 @@ def check_source(source: str, option: str) -> None:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(root, yaml.MappingNode):
         raise ConfigError(f"{path}: needs keys and values, as configs/default.yaml has them")
-    own = sections()
+    section_names = sections()
 
     def check_section(node: yaml.MappingNode, prefix: str) -> None:
         names = set()
@@ -202,7 +202,7 @@ def check_source(source: str, option: str) -> None:
             names.add(key)
             if isinstance(value, yaml.MappingNode):
                 check_section(value, f"{key}.")
-            elif key in own:
+            elif key in section_names:
                 raise ConfigError(f"{where}: {key} is a section; its keys go below it, indented")
             elif key in TYPES:
                 check_value(value, key, where)
@@ -368,22 +368,22 @@ def _in_words(kind: Any) -> str:
 def explain(parser: ArgumentParser, message: str) -> str:
     """Rewrite a message of the parser so that it says what would be right."""
     message = one_line(message)
-    wrong = re.match(r'Parser key "([\w.]+)": ', message)
-    if wrong is not None and wrong[1] in TYPES:
+    invalid = re.match(r'Parser key "([\w.]+)": ', message)
+    if invalid is not None and invalid[1] in TYPES:
         value = re.search(r".*(?:Got|Given) value: (.*)$", message)
         text = shown(value[1])[1:-1] if value else "a value"
-        return f"{wrong[1]} = {'null' if text == 'None' else text}: needs {in_words(wrong[1])}"
-    inside = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
-    beside = re.search(r"[Uu]nrecognized arguments: (.*)", message)
-    alone = re.search(r"Option '([^']*)' is not accepted", message)
-    if inside is not None:
-        key = f"{inside[1]}.{inside[2]}"
-    elif alone is not None:
-        key = alone[1]
-    elif beside is not None and beside[1].startswith("--"):
-        key = re.split(r"[ =]", beside[1][2:])[0]
-    elif beside is not None:
-        return f"{beside[1]}: belongs to no key; a list is one word, such as --game.bin=[10,10,10]"
+        return f"{invalid[1]} = {'null' if text == 'None' else text}: needs {in_words(invalid[1])}"
+    in_section = re.search(r"Group '([\w.]+)' does not accept option '([^']*)'", message)
+    unknown = re.search(r"[Uu]nrecognized arguments: (.*)", message)
+    not_accepted = re.search(r"Option '([^']*)' is not accepted", message)
+    if in_section is not None:
+        key = f"{in_section[1]}.{in_section[2]}"
+    elif not_accepted is not None:
+        key = not_accepted[1]
+    elif unknown is not None and unknown[1].startswith("--"):
+        key = re.split(r"[ =]", unknown[1][2:])[0]
+    elif unknown is not None:
+        return f"{unknown[1]}: no key takes this; a list is one word, such as --game.bin=[10,10,10]"
     else:
         return message
     section, _, last = key.rpartition(".")

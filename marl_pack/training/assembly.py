@@ -123,15 +123,15 @@ def runner_settings(
     ppo.pop("num_envs")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
-    def learner(name: str, own: Agent) -> dict[str, Any]:
-        rate = ppo["learning_rate"] if own.learning_rate is None else own.learning_rate
-        entropy = ppo["entropy_coef"] if own.entropy_coef is None else own.entropy_coef
-        last = final_entropy if own.final_entropy_coef is None else own.final_entropy_coef
+    def learner(name: str, agent: Agent) -> dict[str, Any]:
+        rate = ppo["learning_rate"] if agent.learning_rate is None else agent.learning_rate
+        entropy = ppo["entropy_coef"] if agent.entropy_coef is None else agent.entropy_coef
+        last = final_entropy if agent.final_entropy_coef is None else agent.final_entropy_coef
         return {
-            "network": asdict(own.network),
+            "network": asdict(agent.network),
             "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
             "teacher": teachers.get(name),
-            "teacher_iterations": own.teacher_iterations,
+            "teacher_iterations": agent.teacher_iterations,
             "schedule": {
                 "schedule": schedule, "learning_rate": rate, "entropy_coef": entropy,
                 "final_entropy_coef": entropy if last is None else last,
@@ -150,8 +150,8 @@ def runner_settings(
             "class_name": "marl_pack.agents.learning.ppo:PackingPPO", "iterations": iterations,
         },
         "agents": {
-            name: {"record": frozen[name]} if name in frozen else learner(name, own)
-            for name, own in agents_of(config).items()
+            name: {"record": frozen[name]} if name in frozen else learner(name, agent)
+            for name, agent in agents_of(config).items()
         },
         "latest_every": config.output.latest_every,
         "evaluate_every": config.evaluation.every,

@@ -197,13 +197,13 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
             checkpoint = checkpoints.read(path)
         except ValueError as error:
             raise ConfigError(str(error)) from None
-        own = from_dict(checkpoint["config"])
+        settings = from_dict(checkpoint["config"])
     else:
-        own, _ = parse([f"--config={path.with_name(SETTINGS)}"])
-    config, options = parse(["--config", yaml.safe_dump(own.to_dict()), *arguments])
+        settings, _ = parse([f"--config={path.with_name(SETTINGS)}"])
+    config, options = parse(["--config", yaml.safe_dump(settings.to_dict()), *arguments])
     if len(options.config or []) > 1:
         raise ConfigError("--resume: needs no --config, as the run has its own settings")
-    before, after = own.flat(), config.flat()
+    before, after = settings.flat(), config.flat()
     for key, value in after.items():
         if value != before[key] and not key.startswith(MAY_CHANGE):
             raise ConfigError(
@@ -212,9 +212,9 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
             )
     done = 0
     if checkpoint is not None:
-        _check_size(own, checkpoint)
+        _check_size(settings, checkpoint)
         done = checkpoint["iter"] + 1
-    if config.ppo.max_iterations < min(done, own.ppo.max_iterations):
+    if config.ppo.max_iterations < min(done, settings.ppo.max_iterations):
         raise ConfigError(
             f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
         )
