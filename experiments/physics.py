@@ -19,7 +19,7 @@ from marl_pack.stability import RULES
 
 TABLE1 = [
     *(f"--rules {rule} --objects 3000 --seed 0" for rule in RULES if rule != "none"),
-    "--rules hull_alpha --objects 10000 --seed 1",
+    "--rules hull_alpha --objects 3000 --seed 1",
 ]
 CONTROLS = "controls"
 
