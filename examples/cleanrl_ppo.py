@@ -1,13 +1,15 @@
-"""CleanRL's style: PPO for both agents in one file, on the AEC environment as it is.
+"""CleanRL's style: PPO for both agents in one file, on the unchanged AEC environment.
 
-Versions: needs only marl_pack (which includes PettingZoo and torch):
+It needs only marl_pack, which installs PettingZoo and torch:
     pip install -e . && python examples/cleanrl_ppo.py --items 1000000 --minutes 10
-    Ten minutes on a busy core: 110,476 items, utilization 52.3 → 74.7 %
 
-The recipe for any trainer of your own:
-- A turn is a sample for the agent that acted. Its reward is the sum of what the agent got until its
-  next turn (or the end). PettingZoo's ``env.last()`` returns this sum.
-- Each agent's advantages run over its own turns only.
+In ten minutes on a busy core, training placed 110,476 items. Mean utilization rose from 52.3 % to
+74.7 %.
+
+Two rules for any trainer of your own:
+- A turn is a sample for the agent that acted. The sample's reward is the sum of the rewards that
+  the agent got until its next turn, or until the end. PettingZoo's ``env.last()`` returns this sum.
+- Compute each agent's advantages over its own turns only.
 """
 
 import sys
@@ -39,14 +41,14 @@ class Turns:
 
     def advantages(self) -> Tensor:
         """Compute GAE with γ = 1 over the agent's own turns; the last turn ends an episode."""
-        advantages, after, value = [], 0.0, 0.0
+        advantages, advantage, value = [], 0.0, 0.0
         for k in reversed(range(len(self.actions))):
             if self.ends[k]:
-                after, value = 0.0, 0.0
+                advantage, value = 0.0, 0.0
             delta = self.rewards[k] + value - self.values[k]
-            after = delta + LAMBDA * after
+            advantage = delta + LAMBDA * advantage
             value = self.values[k]
-            advantages.append(after)
+            advantages.append(advantage)
         return torch.tensor(advantages[::-1])
 
 
@@ -58,29 +60,29 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
         env.reset()
         for agent in env.agent_iter():
             observation, reward, terminated, truncated, _ = env.last()
-            own = turns[agent]
-            if own.actions and not own.ends[-1]:
-                own.rewards[-1] = reward
-                own.ends[-1] = terminated or truncated
+            agent_turns = turns[agent]
+            if agent_turns.actions and not agent_turns.ends[-1]:
+                agent_turns.rewards[-1] = reward
+                agent_turns.ends[-1] = terminated or truncated
                 session.credit(agent, reward)
             planes = torch.from_numpy(observation["observation"])
             mask = torch.from_numpy(observation["action_mask"])
             with torch.no_grad():
                 logits, value = networks[agent](planes[None], mask[None])
-            if truncated and own.actions:  # the episode was cut off: add the value of the rest
-                own.rewards[-1] += float(value)
+            if truncated and agent_turns.actions:  # add the critic's value of the steps cut off
+                agent_turns.rewards[-1] += float(value)
             if terminated or truncated:
                 env.step(None)
                 continue
-            choice = Categorical(logits=logits)
-            action = choice.sample()
-            own.planes.append(planes)
-            own.masks.append(mask)
-            own.actions.append(int(action))
-            own.log_probs.append(float(choice.log_prob(action)))
-            own.values.append(float(value))
-            own.rewards.append(0.0)
-            own.ends.append(False)
+            distribution = Categorical(logits=logits)
+            action = distribution.sample()
+            agent_turns.planes.append(planes)
+            agent_turns.masks.append(mask)
+            agent_turns.actions.append(int(action))
+            agent_turns.log_probs.append(float(distribution.log_prob(action)))
+            agent_turns.values.append(float(value))
+            agent_turns.rewards.append(0.0)
+            agent_turns.ends.append(False)
             env.step(int(action))
     return turns
 
@@ -88,20 +90,20 @@ def collect(env: Counted, networks: dict[str, ActorCritic], session: Session) ->
 def learn(turns: Turns, network: ActorCritic, optimizer: torch.optim.Optimizer) -> None:
     """Run PPO's epochs over one agent's turns."""
     planes, masks = torch.stack(turns.planes), torch.stack(turns.masks)
-    actions, old = torch.tensor(turns.actions), torch.tensor(turns.log_probs)
+    actions, old_log_probs = torch.tensor(turns.actions), torch.tensor(turns.log_probs)
     advantages = turns.advantages()
     returns = advantages + torch.tensor(turns.values)
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     for _ in range(EPOCHS):
-        for part in torch.randperm(len(actions)).split(MINIBATCH):
-            logits, values = network(planes[part], masks[part])
-            choice = Categorical(logits=logits)
-            ratio = (choice.log_prob(actions[part]) - old[part]).exp()
-            gain = torch.minimum(
-                ratio * advantages[part], ratio.clamp(1 - CLIP, 1 + CLIP) * advantages[part]
+        for batch in torch.randperm(len(actions)).split(MINIBATCH):
+            logits, values = network(planes[batch], masks[batch])
+            distribution = Categorical(logits=logits)
+            ratio = (distribution.log_prob(actions[batch]) - old_log_probs[batch]).exp()
+            objective = torch.minimum(
+                ratio * advantages[batch], ratio.clamp(1 - CLIP, 1 + CLIP) * advantages[batch]
             )
-            loss = -gain.mean() + 0.5 * (values - returns[part]).pow(2).mean()
-            loss -= 0.005 * choice.entropy().mean()
+            loss = -objective.mean() + 0.5 * (values - returns[batch]).pow(2).mean()
+            loss -= 0.005 * distribution.entropy().mean()
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -114,13 +116,14 @@ def train(session: Session) -> None:
     env.reset(seed=session.seed)
     networks = {agent: ActorCritic(agent.partition("_")[0]) for agent in AGENTS}
     optimizers = {a: torch.optim.Adam(n.parameters(), RATE) for a, n in networks.items()}
+    # The report checks that the weights of these networks change.
     session.watch(*networks.values())
     while session.go_on():
         turns = collect(env, networks, session)
         for agent in AGENTS:
             learn(turns[agent], networks[agent], optimizers[agent])
-        returns = np.sum(turns[AGENTS[1]].rewards) / np.sum(turns[AGENTS[1]].ends)
-        print(f"{session.placed:,} items, return {returns:.3f}")
+        mean_return = np.sum(turns[AGENTS[1]].rewards) / np.sum(turns[AGENTS[1]].ends)
+        print(f"{session.placed:,} items, return {mean_return:.3f}")
 
 
 if __name__ == "__main__":

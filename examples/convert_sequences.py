@@ -2,7 +2,7 @@
 
 Usage: ``python examples/convert_sequences.py dataset/rs.pt rs.npz``. A published file has a list of
 sequences, each a list of boxes [w, d, h] in cells, saved by ``torch.save``. A box as large as the
-bin marks the end of a sequence, and is left out.
+bin marks the end of a sequence and is not converted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 SCALAR = np.int64(0).__reduce__()[0]
-NUMPY_NUMBERS = [  # types that a file may contain; a name depends on NumPy's version
+NUMPY_NUMBERS = [  # types that a file may contain; SCALAR's name depends on NumPy's version
     np.dtype, type(np.dtype(np.int64)),
     (SCALAR, "numpy.core.multiarray.scalar"), (SCALAR, "numpy._core.multiarray.scalar"),
 ]  # fmt: skip
@@ -31,7 +31,7 @@ def read(path: Path, size: Sequence[int]) -> list[NDArray[np.int64]]:
         size: the bin's sides W, D, H in cells.
 
     Raises:
-        ValueError: if the file contains something else; names the sequence.
+        ValueError: if the file contains something else; the message names the sequence.
     """
     try:
         with torch.serialization.safe_globals(NUMPY_NUMBERS):
@@ -62,20 +62,20 @@ def write(sequences: Sequence[NDArray[np.int64]], size: Sequence[int], path: Pat
 
 def main() -> int:
     """Convert one file; return the exit status."""
-    options = argparse.ArgumentParser(description="Convert published sequences.")
-    options.add_argument("source", type=Path, help="the published file, such as dataset/rs.pt")
-    options.add_argument("target", type=Path, help="the file to write, such as rs.npz")
-    options.add_argument(
+    parser = argparse.ArgumentParser(description="Convert published sequences.")
+    parser.add_argument("source", type=Path, help="the published file, such as dataset/rs.pt")
+    parser.add_argument("target", type=Path, help="the file to write, such as rs.npz")
+    parser.add_argument(
         "--bin", type=int, nargs=3, default=(10, 10, 10), metavar=("W", "D", "H"),
         help="the bin's sides in cells (default: 10 10 10)",
     )  # fmt: skip
-    chosen = options.parse_args()
+    options = parser.parse_args()
     try:
-        sequences = read(chosen.source, chosen.bin)
-        write(sequences, chosen.bin, chosen.target)
+        sequences = read(options.source, options.bin)
+        write(sequences, options.bin, options.target)
     except (OSError, ValueError) as error:
-        options.exit(2, f"{options.prog}: {error}\n")
-    print(f"{chosen.target}: {len(sequences):,} sequences, {sum(map(len, sequences)):,} boxes")
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    print(f"{options.target}: {len(sequences):,} sequences, {sum(map(len, sequences)):,} boxes")
     return 0
 
 

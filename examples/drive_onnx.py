@@ -1,4 +1,4 @@
-"""Pack random boxes with the exported agents of a plain run: python drive_onnx.py FOLDER SEED."""
+"""Pack random boxes with exported ``plain`` agents: python drive_onnx.py FOLDER SEED."""
 
 import sys
 
@@ -23,10 +23,10 @@ for sides in generator.integers(2, 6, (200, 3))[:, ORIENTATIONS]:  # an item's s
             window, z = np.s_[x : x + w, y : y + d], heights[x : x + w, y : y + d].max()
             rest[o, x, y], waste[o, x, y] = z, (z - heights[window]).sum()
             cells = np.argwhere((heights[window] == z) & (empty[window] == 0)) @ (1, 1j)
-            corners = np.add.outer(cells, (0, 1, 1j, 1 + 1j)) - (w + 1j * d) / 2  # from the middle
+            corners = np.add.outer(cells, (0, 1, 1j, 1 + 1j)) - (w + 1j * d) / 2  # middle: 0
             angles = np.sort(np.angle(corners[corners != 0]))
             gap = np.diff(angles, append=angles[:1] + 2 * np.pi).max(initial=0)
-            legal[o, x, y] = z + h <= H and 0 < gap < np.pi - 1e-9  # the corners are all around it
+            legal[o, x, y] = z + h <= H and 0 < gap < np.pi - 1e-9  # the hull contains the middle
     if not legal.any():
         break
     o = _act(orient, sides[0], legal.any((1, 2)), legal, rest, waste)

@@ -1,6 +1,6 @@
 """Print the compliance reports of several trainers as one table.
 
-``python examples/report.py FOLDER`` reads the files that examples wrote with ``--json``.
+``python examples/report.py FOLDER`` reads the files that the examples wrote with ``--json``.
 """
 
 from __future__ import annotations

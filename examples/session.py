@@ -1,9 +1,9 @@
 """The command line of the examples, and the compliance report about a trainer.
 
-A trainer passes if it plays no illegal action, always gets new items, changes the weights with
-which both agents choose actions, and credits both agents with the environment's rewards (in sum).
-:class:`Session` checks that from outside: it wraps the environment, keeps a copy of the weights
-before training, and plays held-out sequences before and after.
+A trainer passes if it plays no illegal action, always gets new items, changes the weights that
+choose the actions of both agents, and stores for each agent rewards whose sum is the sum of the
+environment's rewards. :class:`Session` checks this without changing the trainer: it wraps the
+environment, copies the weights before training, and plays held-out sequences before and after.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from marl_pack.files import write_json
 from marl_pack.integrations.network import ActorCritic
 
 HELD_OUT = 10**9
-"""Seed of the sequences that are played before and after training; training has smaller seeds."""
+"""Seed of the sequences played before and after training. Training uses smaller seeds."""
 
 
 class Counted(BaseWrapper):
-    """A wrapper of the environment that counts items, illegal actions, seeds and rewards.
+    """A wrapper of an environment that counts items, illegal actions, seeds and rewards.
 
     Attributes:
         items: number of items placed.
         illegal: number of illegal actions played.
-        seeded: number of resets with a seed; each begins the stream of items again.
-        totals: agent -> sum of its rewards.
+        seeded: number of resets with a seed; each of them begins the stream of items again.
+        totals: sum of the rewards of each agent, by its name.
     """
 
     def __init__(self, env: Any) -> None:
@@ -46,12 +46,12 @@ class Counted(BaseWrapper):
         self.totals = dict.fromkeys(AGENTS, 0.0)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begin an episode, and count its seed."""
+        """Begin an episode; count it if a seed is given."""
         self.seeded += seed is not None
         super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> None:
-        """Play the action, and count it."""
+        """Play the action; count it, its item and the rewards."""
         agent = self.env.agent_selection
         played = not (self.env.terminations[agent] or self.env.truncations[agent])
         if played:
@@ -65,7 +65,7 @@ class Counted(BaseWrapper):
 
 
 class Session:
-    """One run of an example.
+    """One run of an example: its options, environments, counters and compliance report.
 
     Attributes:
         items: approximate number of items to train on.
@@ -74,13 +74,13 @@ class Session:
         seed: seed of weights and items.
 
     Args:
-        arguments: the words of the command line; by default those of this process.
+        arguments: arguments of the command line; None: the arguments of this process.
         description: the text of ``--help``.
     """
 
     def __init__(self, arguments: Sequence[str] | None = None, description: str = "") -> None:
-        options = argparse.ArgumentParser(description=description)
-        add = options.add_argument
+        parser = argparse.ArgumentParser(description=description)
+        add = parser.add_argument
         add("--items", type=int, default=100_000,
             help="number of items to train on (default: 100,000)")  # fmt: skip
         add("--turns", type=int, default=2048,
@@ -95,19 +95,19 @@ class Session:
             help="held-out sequences played before and after training (default: 100)")  # fmt: skip
         add("--seed", type=int, default=0, help="seed of weights and items (default: 0)")
         add("--json", type=Path, metavar="FILE", help="write the compliance report to this file")
-        chosen = options.parse_args(arguments)
-        self.items, self.turns, self.seed = chosen.items, chosen.turns, chosen.seed
-        self.episodes = chosen.episodes
-        self.bin_size, self.sides = tuple(chosen.bin), tuple(chosen.sides)
-        self.json: Path | None = chosen.json
+        options = parser.parse_args(arguments)
+        self.items, self.turns, self.seed = options.items, options.turns, options.seed
+        self.episodes = options.episodes
+        self.bin_size, self.sides = tuple(options.bin), tuple(options.sides)
+        self.json: Path | None = options.json
         if self.episodes < 2:
-            options.error("--episodes: at least 2, for an interval")
-        self.minutes = chosen.minutes or float("inf")
+            parser.error("--episodes: needs at least 2 for an interval")
+        self.minutes = options.minutes or float("inf")
         self.envs: list[Counted] = []
         self.credited = dict.fromkeys(AGENTS, 0.0)
         torch.set_num_threads(1)
-        torch.manual_seed(chosen.seed)
-        np.random.seed(chosen.seed)  # noqa: NPY002  # some trainers use NumPy's global generator
+        torch.manual_seed(options.seed)
+        np.random.seed(options.seed)  # noqa: NPY002  # some trainers use NumPy's global generator
 
     def env(self, **options: Any) -> Counted:
         """Return a new AEC environment (:func:`marl_pack.env_aec.env`) with counters."""
@@ -134,9 +134,13 @@ class Session:
         return sum(env.items for env in self.envs)
 
     def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
-        """Watch the networks that will learn (the same one twice, if it plays both turns).
+        """Remember the networks that will learn, play with them, and start to time the training.
 
-        Training begins here: its minutes are counted from now.
+        The report checks later that the weights of these networks have changed.
+
+        Args:
+            orientation: network of the orientation agent.
+            placement: network of the placement agent; the same network again if one plays both.
         """
         self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
         self.before = {name: self._head(name) for name in AGENTS}
@@ -146,7 +150,7 @@ class Session:
         self.start = time.monotonic()
 
     def _head(self, agent: str) -> torch.Tensor:
-        """Return the weights that only the agent's policy uses, not its critic."""
+        """Return a copy of the weights that the agent's policy uses and its critic does not."""
         network = self.networks[agent]
         head = network.orientations if agent == AGENTS[0] else network.cells
         return head.weight.detach().cpu().clone()
@@ -163,32 +167,32 @@ class Session:
         """
         both = self.networks[AGENTS[0]].agent == "both"
         env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
-        reached = []
+        utilizations = []
         for episode in range(self.episodes):
             env.reset(seed=HELD_OUT if episode == 0 else None)
             for agent in env.agent_iter():
                 observation, _, terminated, truncated, info = env.last()
                 if terminated or truncated:
-                    reached.append(info["utilization"])
+                    utilizations.append(info["utilization"])
                     break
                 network = self.networks[agent]
                 planes, mask = (torch.as_tensor(observation[k], device=network.device)[None]
                                 for k in ("observation", "action_mask"))  # fmt: skip
                 env.step(int(network(planes, mask)[0].argmax()))
-        low, high = interval(np.array(reached)) or (np.nan, np.nan)
-        return float(np.mean(reached)), (high - low) / 2
+        low, high = interval(np.array(utilizations)) or (np.nan, np.nan)
+        return float(np.mean(utilizations)), (high - low) / 2
 
     def report(self, trainer: str, package: str) -> dict[str, Any]:
         """Return the compliance report.
 
         Args:
-            trainer: name of the trainer for the report.
-            package: the trainer's package, for its version.
+            trainer: name of the trainer in the report.
+            package: name of the trainer's package; its version is in the report.
         """
         minutes = self.elapsed
         env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
         updated = {a: not torch.equal(self.before[a], self._head(a)) for a in AGENTS}
-        right = {
+        rewards_right = {
             a: abs(env_rewards[a] - self.credited[a]) <= 1e-4 * max(1.0, abs(env_rewards[a]))
             for a in AGENTS
         }
@@ -201,7 +205,7 @@ class Session:
             "illegal": sum(env.illegal for env in self.envs),
             "repeats": sum(max(0, env.seeded - 1) for env in self.envs),
             "updated": updated,
-            "rewards_right": right,
+            "rewards_right": rewards_right,
             "rewards": env_rewards,
             "credited": self.credited,
             "episodes": self.episodes,
@@ -214,7 +218,7 @@ _running: list[Session] = []
 
 
 def current() -> Session:
-    """Return the running session, for trainers that make environments from a pickled function."""
+    """Return the running session: for trainers that make environments by a pickled function."""
     return _running[-1]
 
 
@@ -226,6 +230,13 @@ def run(
     description: str = "",
 ) -> int:
     """Run an example and print its compliance report.
+
+    Args:
+        trainer: name of the trainer in the report.
+        package: name of the trainer's package, for its version.
+        train: the function that trains both agents until the session ends.
+        arguments: arguments of the command line; None: the arguments of this process.
+        description: the text of ``--help``.
 
     Returns:
         The exit status: 0 if it :func:`passes`.
@@ -245,13 +256,13 @@ def run(
     return 0
 
 
-def percent(reached: tuple[float, float]) -> str:
-    """Return a utilization and half its interval as text."""
-    return f"{100 * reached[0]:.1f} ± {100 * reached[1]:.1f} %"
+def percent(utilization: tuple[float, float]) -> str:
+    """Return a utilization and half the width of its interval as text, in percent."""
+    return f"{100 * utilization[0]:.1f} ± {100 * utilization[1]:.1f} %"
 
 
 def passes(report: dict[str, Any]) -> bool:
-    """Return whether a report has items, no faults, and correct updates and rewards for both."""
+    """Return whether a report has items, no faults, new weights and correct rewards."""
     return bool(
         report["items"]
         and not report["illegal"]
