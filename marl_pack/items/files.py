@@ -27,11 +27,13 @@ FIELDS = ("items", *KEYS, "lengths", "bin")
 
 
 def read_fields(path: Path) -> dict[str, Any]:
-    """Return the fields of a file by key, some of :data:`FIELDS`; its ending says the format.
+    """Read a file and return its fields by key.
+
+    The keys are some of :data:`FIELDS`. The ending of the file's name decides its format.
 
     Raises:
-        ValueError: for another ending, an unreadable file, a missing or unknown column, key or
-            array, or a row that is not three numbers; the message names the row.
+        ValueError: if the ending is unknown, the file cannot be read, a column, key or array is
+            missing or unknown, or a row is not three numbers (the message names the row).
     """
     readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
     suffix = path.suffix.lower()
@@ -42,16 +44,21 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def check_fields(fields: Mapping[str, Any], source: str, what: str = "key") -> None:
-    """Refuse unknown keys and missing items; messages call a key ``what``.
+    """Refuse unknown keys and missing items.
+
+    Args:
+        fields: the fields by key.
+        source: the name of the file, for messages.
+        what: the word for a key in messages.
 
     Raises:
-        ValueError: naming the nearest valid key.
+        ValueError: if a key is unknown or missing; the message names the most similar valid key.
     """
     check_names(fields, FIELDS, ("items",), source, what)
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
-    """Return the arrays of an archive."""
+    """Return the arrays of an npz archive by name."""
     fields: dict[str, Any] = dict(read_arrays(path))
     check_fields(fields, str(path), "array")
     if "bin" in fields:
@@ -60,7 +67,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Return the fields of an object in JSON, or the field ``items`` for a list."""
+    """Return the fields of a JSON file; a file that holds a list has only the field ``items``."""
     content = read_json(path)
     fields = content if isinstance(content, dict) else {"items": content}
     check_fields(fields, str(path))
@@ -68,43 +75,48 @@ def _read_json(path: Path) -> dict[str, Any]:
         if value is None:
             raise ValueError(f"{path}: key {key!r} is null; needs values, or to be left out")
     sequences, _ = split_sequences(fields["items"], str(path))
-    if all(isinstance(sequence, list) for sequence in sequences):  # none is padded with zeros
+    if all(isinstance(sequence, list) for sequence in sequences):  # lists are never padded
         fields.setdefault("lengths", [len(sequence) for sequence in sequences])
     return fields
 
 
 def _read_csv(path: Path) -> dict[str, Any]:
-    """Return the columns of a table with one item a row, split into sequences."""
-    cells = _read_table(path)
-    sides = np.column_stack([_numbers(path, cells, name) for name in SIDES])
+    """Return the fields of a CSV file, which has one item per row, split into sequences."""
+    columns = _read_table(path)
+    sides = np.column_stack([_numbers(path, columns, name) for name in SIDES])
     fields = {"items": sides} | {
-        attribute.key: attribute.of_cells(cells[attribute.column])
+        attribute.key: attribute.of_cells(columns[attribute.column])
         for attribute in ATTRIBUTES
-        if attribute.column in cells
+        if attribute.column in columns
     }
-    if "sequence" not in cells:
+    if "sequence" not in columns:
         return fields | {"lengths": [len(sides)]}
     ranks: dict[str, int] = {}  # sequences in the order of their first rows
-    rank = np.array([ranks.setdefault(name, len(ranks)) for name in cells["sequence"]])
+    rank = np.array([ranks.setdefault(name, len(ranks)) for name in columns["sequence"]])
     order, counts = rank.argsort(kind="stable"), np.bincount(rank)
-    return {key: Ragged(_selected(values, order), counts) for key, values in fields.items()}
+    return {key: Ragged(_reordered(values, order), counts) for key, values in fields.items()}
 
 
-def _selected(values: list[Any] | NDArray[Any], order: NDArray[np.int64]) -> Any:
-    """Return the values in another order."""
+def _reordered(values: list[Any] | NDArray[Any], order: NDArray[np.int64]) -> Any:
+    """Return the values in a new order.
+
+    Args:
+        values: the values.
+        order: int64 [n], the old index of each value.
+    """
     if isinstance(values, np.ndarray):
         return values[order]
     return [values[i] for i in order.tolist()]
 
 
-def _numbers(path: Path, cells: dict[str, list[str]], name: str) -> NDArray[np.float64]:
-    """Return a column of numbers; refuse the first row in which it is not a number."""
+def _numbers(path: Path, columns: dict[str, list[str]], name: str) -> NDArray[np.float64]:
+    """Return a column of numbers; refuse the first row whose text is not a number."""
     numbers: list[float] = []
     try:
-        for text in cells[name]:
+        for text in columns[name]:
             numbers.append(number_in(text))
     except ValueError as error:
-        row = [cells[side][len(numbers)] for side in SIDES]
+        row = [columns[side][len(numbers)] for side in SIDES]
         raise ValueError(
             f"{path}: row {len(numbers)} is {shown(row)}: {name} {error}; needs whole cells ≥ 1"
         ) from None
@@ -112,7 +124,7 @@ def _numbers(path: Path, cells: dict[str, list[str]], name: str) -> NDArray[np.f
 
 
 def _read_table(path: Path) -> dict[str, list[str]]:
-    """Return the texts of each column by its name.
+    """Read a CSV file; return the texts of each column by the column's name.
 
     Raises:
         ValueError: for a column that is missing, unknown or given twice, or a row with too few
@@ -125,16 +137,17 @@ def _read_table(path: Path) -> dict[str, list[str]]:
     check_names(columns, COLUMNS, SIDES, str(path), "column")
     if len(set(columns)) < len(columns):
         raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
-    cells: list[str] = []  # row by row in one list: a list for each row is three times slower
+    # One list for all rows, row by row: a list for each row is three times slower.
+    values: list[str] = []
     for line, row in lines:
         if len(row) > len(columns) and not any(row[len(columns) :]):
             del row[len(columns) :]
         if len(row) != len(columns) or "" in row:
             raise ValueError(
-                f"{path}: row {len(cells) // len(columns)} (line {line}) is {shown(row)}: needs a "
+                f"{path}: row {len(values) // len(columns)} (line {line}) is {shown(row)}: needs a "
                 f"value for each of {', '.join(columns)}"
             )
-        cells += row
-    if not cells:
+        values += row
+    if not values:
         raise ValueError(f"{path}: has no items")
-    return {name: list(map(str.strip, cells[i :: len(columns)])) for i, name in enumerate(columns)}
+    return {name: list(map(str.strip, values[i :: len(columns)])) for i, name in enumerate(columns)}

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Offsets = tuple[tuple[float, float], ...]
-"""For each of A orientations, the centre of mass from the geometric centre along x and y, in
-fractions of the item's sides as oriented."""
+"""For each of A orientations: x and y of the centre of mass minus those of the geometric centre, as
+fractions of the sides w and d after the item is rotated."""
 
 HALF = Fraction(1, 2)
 
@@ -46,7 +46,8 @@ def _decimal(value: float) -> Fraction:
 class CentreTable:
     """Positions of centres of mass, for A orientations, both axes and every side from 0 to L.
 
-    Coordinates count from the window's low corner in units of 1 / ``unit`` cells.
+    Coordinates are measured from the footprint's corner with the smallest x and y, in units of
+    1 / ``unit`` cells.
     """
 
     at: NDArray[np.float64]  # [A, 2, L + 1]  the centre of mass
@@ -54,8 +55,8 @@ class CentreTable:
     low: NDArray[np.int64]
     # int64 [A, 2, L + 1]: first cell that ends more than the margin above the centre of mass
     start: NDArray[np.int64]
-    unit: float  # units in a cell
-    margin: float  # in units
+    unit: float  # number of units in a cell
+    margin: float  # in units; by so much the support polygon is shrunk
     whole: bool  # all coordinates and the margin are whole numbers: float64 is exact on them
 
     def cells(self, sides: Tensor) -> Tensor:
@@ -79,9 +80,9 @@ def centre_table(offsets: Offsets, margin: float, longest: int) -> CentreTable:
     """Compute the table of centres of mass in exact arithmetic.
 
     Args:
-        offsets: offsets for each orientation; decimals are taken exactly.
+        offsets: the offsets of the centre of mass; decimals are taken exactly.
         margin: cells by which the support polygon is shrunk; a decimal is taken exactly.
-        longest: L, the longest side that a window may have.
+        longest: L, the longest side of a footprint, in cells.
     """
     shares = [[HALF + exact(offset) for offset in pair] for pair in offsets]
     exact_margin = exact(margin)

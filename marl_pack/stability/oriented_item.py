@@ -1,4 +1,4 @@
-"""The oriented item, an input of the stability rules: one item per bin in several orientations."""
+"""The items to place, one per bin in several orientations, as input of the stability rules."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from marl_pack.stability.parameters import NO_OFFSET
 
 @dataclass(frozen=True)
 class OrientedItem:
-    """One item per bin in A orientations; by default its mass is central and equals its volume."""
+    """One item for each of N bins, in several orientations (their number is A)."""
 
-    sides: Tensor  # int16 [N, A, 3]  w, d, h along x, y, z; a zero side: orientation not allowed
-    # for each orientation, the centre of mass from the geometric centre in fractions of w and d
+    # int16 [N, A, 3]: w, d, h along x, y, z; all 0 if the orientation is not allowed
+    sides: Tensor
+    # For each orientation: x and y of the centre of mass minus those of the geometric centre, as
+    # fractions of w and d; None: no offset.
     offsets: Offsets | None = None
-    weight: Tensor | None = None  # float64 [N]
+    weight: Tensor | None = None  # float64 [N]; None: the volume
 
     def __getitem__(self, index: Tensor | slice) -> OrientedItem:
         """Return the oriented items of the chosen bins."""
@@ -27,19 +29,28 @@ class OrientedItem:
         return OrientedItem(self.sides[index], self.offsets, weight)
 
     def centre_table(self, margin: float, longest: int) -> CentreTable:
-        """Return the table of the centres of mass for sides up to ``longest`` cells."""
+        """Return the table of the centres of mass for sides up to ``longest`` cells.
+
+        Args:
+            margin: cells by which the support polygon is shrunk.
+            longest: the longest side in cells.
+        """
         offsets = ((0.0, 0.0),) * self.sides.shape[1] if self.offsets is None else self.offsets
         return centre_table(offsets, margin, longest)
 
     def exact_centre(self, orientation: int, w: int, d: int) -> tuple[Fraction, Fraction]:
-        """Return the centre of mass from the window's low corner, for a footprint of w x d."""
-        x, y = (0.0, 0.0) if self.offsets is None else self.offsets[orientation]
-        return w * (HALF + exact(x)), d * (HALF + exact(y))
+        """Return x and y of the centre of mass, for a footprint of w x d.
+
+        They are measured from the footprint's corner with the smallest x and y.
+        """
+        offset_x, offset_y = (0.0, 0.0) if self.offsets is None else self.offsets[orientation]
+        return w * (HALF + exact(offset_x)), d * (HALF + exact(offset_y))
 
     def weights(self) -> Tensor:
         """Return the weight of each bin's item, float64 [N]."""
         if self.weight is not None:
             return self.weight.double()
+        # An orientation that is not allowed has sides and volume 0, so take the largest volume.
         return self.sides.double().prod(-1).amax(1)
 
 
@@ -51,10 +62,11 @@ def orient_item(
     """Return one item per bin in all six orientations.
 
     Args:
-        items: int [N, 3], each item's own sides w, d, h; zeros where there is no item.
-        weight: float [N], volume by default.
-        com_offset: how far the centre of mass lies from the geometric centre, as fractions of the
-            item's own sides; it rotates with the item.
+        items: int [N, 3], the sides w, d, h of each item before it is rotated; zeros where there
+            is no item.
+        weight: float [N], the volume by default.
+        com_offset: x, y, z of the centre of mass minus those of the geometric centre, as fractions
+            of w, d, h before the item is rotated; it rotates with the item.
     """
     offsets = None
     if any(com_offset):

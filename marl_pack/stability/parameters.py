@@ -1,4 +1,4 @@
-"""Parameters of rules and of items: thresholds of supported areas, and centres of mass."""
+"""Check parameters of stability rules and items: area thresholds and centres of mass."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from marl_pack.checks import real_number, shown, whole_number
 Thresholds = tuple[tuple[float, int], ...]
 
 PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
-"""The thresholds of the paper, pairs (share, corners). A box is stable if, for one of the pairs,
-more than this share of its bottom face and at least so many of its corners are supported."""
+"""The thresholds in the text of Zhang et al. (2025), as pairs (share, corners). A box is stable if,
+for one of the pairs, more than this share of its bottom face and at least this number of its
+corners are supported."""
 CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
-"""The thresholds of the authors' released code."""
+"""The thresholds in the code that the authors released."""
 THRESHOLDS = {"paper": PAPER, "code": CODE}
 """The thresholds by name."""
 
@@ -18,7 +19,7 @@ NO_OFFSET = (0.0, 0.0, 0.0)
 
 
 def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return the offset of the centre of mass as three floats.
+    """Check the offset of a centre of mass and return it as three floats.
 
     Raises:
         ValueError: unless there are three numbers, each strictly between -0.5 and 0.5.
@@ -36,7 +37,7 @@ def check_com_offset(offset: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def check_thresholds(thresholds: Thresholds | str) -> Thresholds:
-    """Return the thresholds given by name (``"paper"``, ``"code"``) or as pairs.
+    """Check thresholds, a name (``"paper"``, ``"code"``) or pairs, and return them as pairs.
 
     Raises:
         ValueError: for an unknown name, a share outside [0, 1] or corners outside 0 … 4.
