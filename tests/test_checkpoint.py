@@ -165,7 +165,7 @@ def test_mismatched_weights_and_missing_agents_are_named(runs: Path) -> None:
     with pytest.raises(ValueError, match="no orientation agent; it has: joint"):
         record_of(str(runs / "joint"), "orientation")
     frozen = checkpoints.agent_record(checkpoints.read(runs / "frozen"), "orientation")
-    with pytest.raises(ValueError, match="the orientation agent is played by random"):
+    with pytest.raises(ValueError, match="the orientation agent is the heuristic random"):
         load_actor(frozen, "orientation", "cpu")
 
 

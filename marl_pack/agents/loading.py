@@ -1,4 +1,9 @@
-"""Load agents and policies by name, from a run's folder or from a checkpoint."""
+"""Load agents and policies by name, from a run's folder or from a checkpoint.
+
+A *record* describes one agent. It is the part of a checkpoint that the agent needs to play: the
+settings and the weights of its network, or ``{"name": …}`` for a heuristic
+(:mod:`marl_pack.agents.learning.checkpoint`).
+"""
 
 from __future__ import annotations
 
@@ -38,13 +43,13 @@ from marl_pack.items import GENERATED, Stream, independent, make_stream
 
 
 class Loader:
-    """A loader of agents that play together and share the results that are computed once a turn.
+    """Load agents that play together and share the results that are computed once per turn.
 
     Args:
         device: the device of the games.
-        seed: of agents that play at random; with None they use torch's global generator.
+        seed: the seed of agents that play at random; with None they use torch's global generator.
         symmetric: whether learned agents average over the symmetries of the bin.
-        memo: stores the results that are computed once a turn; a new one by default.
+        memo: stores the results that are computed once per turn; a new memo by default.
     """
 
     def __init__(
@@ -66,7 +71,7 @@ class Loader:
         Args:
             source: one of :data:`marl_pack.agents.keys.POLICIES`, a published model's name
                 (:mod:`marl_pack.published`), the path of a run's folder or a checkpoint, or
-                ``FILE.py:NAME``, a function of your own.
+                ``FILE.py:NAME`` for a function that you wrote.
 
         Raises:
             ValueError, FileNotFoundError: if ``source`` is none of these.
@@ -83,7 +88,7 @@ class Loader:
     def orientation_agent(self, source: str) -> OrientationAgent:
         """Return the orientation agent that ``source`` names.
 
-        A joint agent chooses cells too; they are ignored.
+        A joint agent also chooses cells, which are ignored.
 
         Raises:
             ValueError, FileNotFoundError: if there is no such agent.
@@ -109,7 +114,7 @@ class Loader:
     # --- from records and checkpoints -------------------------------------------------------------
 
     def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
-        """Return the policy of a checkpoint, its frozen agents included."""
+        """Return the policy of a checkpoint, including its frozen agents."""
         if JOINT in checkpoint["agents"]:
             return JointPolicy(self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT))
         return InTurns(
@@ -132,7 +137,12 @@ class Loader:
         return self.learned(record, PLACEMENT)
 
     def agent_of(self, record: Mapping[str, Any], name: str) -> Callable[..., Tensor]:
-        """Return the agent ``name`` (orientation or placement) that a record describes."""
+        """Return the agent that a record describes.
+
+        Args:
+            record: the record of the agent.
+            name: ``orientation`` or ``placement``.
+        """
         makers: dict[str, Callable[[Mapping[str, Any]], Callable[..., Tensor]]] = {
             ORIENTATION: self.orientation_agent_of,
             PLACEMENT: self.placement_agent_of,
@@ -143,7 +153,7 @@ class Loader:
         """Return the learned agent that a record describes.
 
         Raises:
-            ValueError: if the agent has no network, or its weights do not match it.
+            ValueError: if the record has no network, or its weights do not match the network.
         """
         actor = load_actor(record, kind, self.device)
         return LearnedAgent(kind, actor, self._lookahead(record), self.symmetric)
@@ -169,8 +179,8 @@ class Loader:
             futures: the stream from which future items are drawn.
 
         Raises:
-            ValueError: if an agent is not learned, or the settings have a depth and the critic does
-                not estimate shares of the bin.
+            ValueError: if an agent is not learned, or the settings have a depth and the critic was
+                not trained to estimate filled shares of the bin.
         """
         first, second = (
             self.learned(checkpoints.agent_record(checkpoint, name), name)
@@ -192,7 +202,7 @@ class Loader:
 def imagined_stream(
     checkpoint: Mapping[str, Any], size: Size | None = None, played: Stream | None = None
 ) -> Stream:
-    """Return the stream of the items that a search imagines, like the items of the training.
+    """Return the stream from which a search draws future items, like the items in training.
 
     Args:
         checkpoint: the checkpoint of the agents.
@@ -203,33 +213,35 @@ def imagined_stream(
         ValueError: if there is no such stream.
     """
     game = trained_game(checkpoint)
+    stream = played
     if game["items"] in GENERATED:
         try:
-            played = make_stream(game["items"], size or game["bin"], tuple(game["sides"]))
+            stream = make_stream(game["items"], size or game["bin"], tuple(game["sides"]))
         except ValueError as error:
             raise ValueError(f"items of the agents' training: {error}") from None
-    if played is None:
+    if stream is None:
         raise ValueError(
-            f"search: needs agents trained on one of {', '.join(GENERATED)}, not {game['items']}"
+            f"plan: needs agents trained on one of {', '.join(GENERATED)}, not {game['items']}"
         )
-    return independent(played)
+    return independent(stream)
 
 
 def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str) -> Actor:
     """Return the network of a learned agent.
 
     Args:
-        record: the agent's record (:mod:`marl_pack.agents.learning.checkpoint`).
+        record: the agent's record.
         kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         device: the device of the games.
 
     Raises:
-        ValueError: if the agent has no network, or its weights do not match it.
+        ValueError: if the record has no network, or its weights do not match the network.
     """
     if "network" not in record:
-        raise ValueError(f"the {kind} agent is played by {record.get('name')}: it has no network")
+        name = record.get("name")
+        raise ValueError(f"the {kind} agent is the heuristic {name}: it has no network")
     checkpoints.check_weights(record, kind)
-    with torch.random.fork_rng(devices=[]):  # a run's random numbers stay the same
+    with torch.random.fork_rng(devices=[]):  # do not change the run's random numbers
         actor = make_actor(kind, record["network"], device)
     actor.load_state_dict(record["actor_state_dict"])
     return actor.eval()
@@ -280,7 +292,7 @@ def load_afterstate_critic(
 
 
 def record_of(source: str, name: str) -> dict[str, Any]:
-    """Return the record of an agent of another run, or of a heuristic.
+    """Return the record of a heuristic, or of an agent in a checkpoint.
 
     Args:
         source: a heuristic's or a published model's name, or the path of a run's folder or a
@@ -303,7 +315,8 @@ def trained_game(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     They are the options of :class:`marl_pack.game.spec.GameSpec`, ``items`` and ``sides``.
 
     Raises:
-        ValueError: if a setting that every version wrote is missing, or a value is impossible.
+        ValueError: if a value is impossible, or a setting is missing that every version of
+            marl_pack writes.
     """
     game = checkpoint["config"].get("game", {})
     for key in ("bin", "rule", "items", "sides"):
@@ -319,7 +332,8 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
         ValueError: if its settings do not describe a game.
     """
     game, seed = trained_game(checkpoint), checkpoint["config"].get("seed", "unknown")
-    sides = "" if "." in game["items"] else f" {game['sides'][0]}-{game['sides'][1]}"
+    is_file = "." in game["items"]  # names of generated streams have no dot
+    sides = "" if is_file else f" {game['sides'][0]}-{game['sides'][1]}"
     return (
         f"{game['items']}{sides}, {GameSpec.of(game)}, {checkpoint['items']:,} items, seed {seed}"
     )

@@ -13,13 +13,13 @@ MOST = 1 << 20
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """The number of pairs and futures that a search tries, and their depth.
+    """The number of pairs and futures that a search tries, and the length of each future.
 
     Args:
         rollouts: number K of imagined futures for each pair, on average.
-        top: number M of pairs to try.
+        top: number M of pairs (orientation, cell) to try.
         depth: number of items to place in each future before the orientation agent's critic
-            estimates the rest; None plays every future to its end.
+            estimates the rest of the return; None plays every future to its end.
     """
 
     rollouts: int = 16
