@@ -147,12 +147,12 @@ def test_a_resumed_run_may_be_longer_but_not_different(
     message = capsys.readouterr().err
     assert "the run has game.bin = [5, 5, 5], not [6, 6, 6]" in message
     assert main(["--resume", run, "--ppo.max_iterations=1"]) == 2
-    assert "has done 2 already" in capsys.readouterr().err
+    assert "has already finished 2 iterations" in capsys.readouterr().err
     assert main(["--resume", run, "--ppo.max_iterations=3"]) == 0
     assert checkpoints.read(Path(run) / "latest.pt")["iter"] == 2
     assert main(["--resume", run, "--config=configs/default.yaml"]) == 2
     assert main(["--resume", str(tmp_path / "nothing")]) == 2
-    assert "no such checkpoint" in capsys.readouterr().err
+    assert "no such folder or checkpoint" in capsys.readouterr().err
     assert main(["--resume"]) == 2
 
 
@@ -288,7 +288,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     assert main([*options, "--output.name=whole"]) == 0
     run.mkdir()  # all that there is when it is killed at once
     assert main(["--resume", str(run)]) == 2
-    assert "no run has begun there; train it without --resume" in capsys.readouterr().err
+    assert "no run has begun there; begin one without --resume" in capsys.readouterr().err
     assert main(options) == 0
     assert same(networks(run), networks(whole))
     shutil.rmtree(run)
@@ -304,7 +304,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     assert not list(run.glob(".part-*"))
     (run / "latest.pt").unlink()
     assert main(["--resume", str(run)]) == 2
-    assert f"{run}: needs the folder of a run, with latest.pt" in capsys.readouterr().err
+    assert f"{run}: not the folder of a run: it has no latest.pt" in capsys.readouterr().err
 
 
 def test_a_run_is_trained_by_one_process_and_resumed_with_its_own_record(

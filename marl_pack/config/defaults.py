@@ -1,4 +1,4 @@
-"""Write every setting at its default, each below a comment that says what it means."""
+"""Write the file of all settings with their defaults, each below a comment with its meaning."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from docstring_parser import parse
 from marl_pack.config.schema import Config
 
 TITLE = """\
-# Every setting at its default: the settings that learn best on RS. Other files hold only what they
-# change. `make configs` writes this file from the code.
+# All settings with their defaults, which learn best on RS. Other files contain only settings that
+# differ. `make configs` writes this file from the code.
 #   marl-pack train --config default
 """
 
 
 def default_yaml() -> str:
-    """Return the text of ``configs/default.yaml``: each default, with its docstring as comment."""
+    """Return the text of ``configs/default.yaml``: each default below a comment, its docstring."""
     return "\n".join([TITLE, *_lines(Config(), "")])
 
 
 def _lines(section: Any, indent: str) -> list[str]:
-    """Return the lines of a section; a section without indent has blank lines between its keys."""
+    """Return the lines of a section; blank lines separate the keys if there is no indent."""
     documented = parse(section.__doc__ or "").params
-    sentences = {part.arg_name: part.description or "" for part in documented}
+    descriptions = {param.arg_name: param.description or "" for param in documented}
     lines: list[str] = []
     for field in fields(section):
-        comment = " ".join(sentences[field.name].split())
+        comment = " ".join(descriptions[field.name].split())
         lines += textwrap.wrap(
             comment, 100, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ",
             break_on_hyphens=False,
@@ -44,7 +44,7 @@ def _lines(section: Any, indent: str) -> list[str]:
 
 
 def _value(value: Any) -> str:
-    """Return a plain value as YAML, a list on one line."""
+    """Return a plain value as YAML on one line."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return value if isinstance(value, str) else json.dumps(value)

@@ -1,4 +1,4 @@
-"""A window that shows pictures one after the other."""
+"""A window that shows pictures one after another."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Window:
     """A window of matplotlib that opens with the first picture."""
 
     def __init__(self) -> None:
-        self._parts: tuple[Any, Any] | None = None  # figure, its picture
+        self._parts: tuple[Any, Any] | None = None  # matplotlib's figure and AxesImage
 
     def show(self, image: NDArray[np.uint8]) -> None:
-        """Show a picture, uint8 [rows, columns, 3]; all pictures have the same size."""
+        """Show a picture, uint8 [rows, columns, 3]; all pictures must have the same size."""
         from matplotlib import pyplot
 
         if self._parts is None:
@@ -31,8 +31,8 @@ class Window:
             axes.axis("off")
             self._parts = figure, axes.imshow(image)
             figure.show(warn=False)
-        figure, picture = self._parts
-        picture.set_data(image)
+        figure, axes_image = self._parts
+        axes_image.set_data(image)
         figure.canvas.draw_idle()
         figure.canvas.flush_events()
 

@@ -40,7 +40,7 @@ def local_device(config: Config) -> str:
 
 
 def derived_seed(*parts: int) -> int:
-    """Derive a seed from numbers; it differs from the small seeds that users choose."""
+    """Derive a seed from numbers; it is large, so it differs from the seeds that users choose."""
     low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
     return int(high >> 1) << 32 | int(low)
 
@@ -61,7 +61,7 @@ def make_stream(config: Config) -> Stream:
 def make_game(
     config: Config, n: int, seed: int, *, auto_reset: bool, device: str, first_episode: int = 0
 ) -> Packing:
-    """Return G = ``n`` games with the options of the settings."""
+    """Return ``n`` games with the options in the settings."""
     return Packing(
         n, items=make_stream(config), spec=config.game, auto_reset=auto_reset, device=device,
         seed=seed, first_episode=first_episode,
@@ -82,11 +82,11 @@ def other_agents(
 
     Args:
         config: the settings of the run.
-        checkpoint: the checkpoint of the run to resume. It holds the records; the record of a
-            teacher only while it is cloned.
+        checkpoint: the checkpoint of the run to resume, which contains the records; it has a
+            teacher's record only as long as the teacher is cloned.
 
     Raises:
-        ConfigError: if an agent cannot be loaded; names the key.
+        ConfigError: if an agent cannot be loaded; the message names the key.
     """
     records: dict[str, dict[str, Any]] = {"policy": {}, "teacher": {}}
     for name, agent in agents_of(config).items():

@@ -17,7 +17,7 @@ from rich.text import Text
 from marl_pack.agents.learning.logging import Progress
 from marl_pack.evaluation.statistics import spread
 
-QUIET_SECONDS = 30.0  # between lines of progress where the output is not a terminal
+QUIET_SECONDS = 30.0  # between two lines of progress if the output is not a terminal
 
 
 class Display:
@@ -31,7 +31,7 @@ class Display:
             TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), console=console,
         )  # fmt: skip
         self.text = Text()
-        self.figures = ""  # of the last iteration
+        self.figures = ""  # the text for the last iteration
         self.view = Live(Group(self.bar, self.text), console=console, refresh_per_second=2)
         self.task = self.bar.add_task("", total=total, completed=done)
         self.shown_at = 0.0
@@ -54,7 +54,7 @@ class Display:
 
     @staticmethod
     def lines(progress: Progress) -> list[str]:
-        """Return a line with speed, utilization and reward, and one with entropies and KLs."""
+        """Return two lines: speed, utilization and reward; entropies and KLs of the agents."""
         figures = [f"{progress.items_per_second:,.0f} items/s"]
         if not math.isnan(progress.utilization):
             figures.append(f"util {100 * progress.utilization:.1f} %")
@@ -62,12 +62,12 @@ class Display:
             figures.append(f"reward {progress.reward:.3f}")
         learners = []
         for name in dict.fromkeys(key.partition("/")[0] for key in progress.losses if "/" in key):
-            entropy, kl = (progress.losses[f"{name}/{what}"] for what in ("entropy", "kl"))
+            entropy, kl = (progress.losses[f"{name}/{loss}"] for loss in ("entropy", "kl"))
             learners.append(f"{name} entropy {entropy:.3f} KL {kl:.3f}")
         return ["  ".join(figures), "  ".join(learners)]
 
     def evaluating(self) -> None:
-        """Show that an evaluation is under way."""
+        """Show that an evaluation is running."""
         self.text.plain = f"{self.figures}\nevaluating on held-out sequences"
 
     def evaluated(self, row: Mapping[str, Any]) -> None:

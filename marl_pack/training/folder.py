@@ -27,14 +27,14 @@ from marl_pack.files import PART, remove_unfinished, write_atomically, write_jso
 
 PACKAGES = ("torch", "rsl-rl-lib", "tensordict", "numpy", "numba", "scipy", "pettingzoo")
 SETTINGS, RECORD, LOCK = "config.yaml", "run.json", ".lock"
-BEFORE_THE_RUN = {SETTINGS, RECORD, LOCK}  # files that precede the first checkpoint
-MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # beside --resume
+BEFORE_THE_RUN = {SETTINGS, RECORD, LOCK}  # files that a run writes before its first checkpoint
+MAY_CHANGE = ("output.", "evaluation.", "ppo.max_iterations")  # settings that --resume may change
 
 
 def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
     """Write the history of evaluations as CSV."""
     text = io.StringIO()
-    # An earlier version may have written other columns.
+    # In a run of an earlier version, the first rows may have other columns: leave these out.
     writer = csv.DictWriter(text, list(history[-1]), extrasaction="ignore")
     writer.writeheader()
     writer.writerows(history)
@@ -44,13 +44,13 @@ def write_history(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
 def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None:
     """Write the settings, the command and the packages' versions into the run's folder.
 
-    If the run is resumed, the new record is added to the record of its start.
+    If the run is resumed, the new record is added to the record in the folder.
     """
     text = yaml.safe_dump(config.to_dict(), sort_keys=False)
     write_atomically(folder / SETTINGS, lambda file: file.write(text.encode()))
     versions = {"python": platform.python_version(), "marl_pack": marl_pack.__version__}
     versions |= {name: metadata.version(name) for name in PACKAGES}
-    before = read_record(folder)
+    first_record = read_record(folder)
     record: dict[str, Any] = {
         "arguments": list(arguments),
         "seed": config.seed,
@@ -58,24 +58,24 @@ def write_record(folder: Path, config: Config, arguments: Sequence[str]) -> None
         "processes": int(os.environ.get("WORLD_SIZE", "1")),
         "versions": versions,
     }
-    if before is not None:  # the run is resumed: keep the record of its start
-        before.setdefault("resumed", []).append(record)
-        record = before
+    if first_record is not None:  # the run is resumed: keep its first record
+        first_record.setdefault("resumed", []).append(record)
+        record = first_record
     write_json(folder / RECORD, record)
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """Return the record of a run; None if there is none.
+    """Read the record of a run; return None if there is no file.
 
     Raises:
-        ConfigError: if the file is not such a record.
+        ConfigError: if the file is not the record of a run.
     """
     path = folder / RECORD
     if not path.exists():
         return None
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        json.dumps(record, allow_nan=False)  # it will be written again
+        json.dumps(record, allow_nan=False)  # refuse NaN, which could not be written again
         if isinstance(record["arguments"], list) and isinstance(record.get("resumed", []), list):
             return dict(record)
     except (ValueError, TypeError, KeyError, RecursionError):
@@ -86,31 +86,34 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def _check_free(folder: Path) -> None:
-    """Refuse a folder that contains more than a run writes before its first checkpoint.
+    """Refuse a folder with files other than those that a run writes before its first checkpoint.
 
     Raises:
-        ConfigError: if the folder contains more; says what would be right.
+        ConfigError: if the folder has other files; the message says what to do.
     """
     if (folder / checkpoints.LATEST).exists():
         raise ConfigError(
-            f"output.name: {folder} holds a run; --resume {folder} continues it; or name another"
+            f"output.name: {folder} contains a run; continue it with --resume "
+            f"{folder}, or choose another output.name"
         )
-    if folder.exists() and (not folder.is_dir() or _holds_more(folder)):
-        raise ConfigError(f"output.name: {folder} exists already; name another")
+    if folder.exists() and (not folder.is_dir() or _has_other_files(folder)):
+        raise ConfigError(f"output.name: {folder} exists already; choose another name")
 
 
-def _holds_more(folder: Path) -> bool:
-    """Return whether a folder contains more than a run writes before its first checkpoint."""
+def _has_other_files(folder: Path) -> bool:
+    """Return whether a folder has files that no run writes before its first checkpoint."""
     names = (path.name for path in folder.iterdir())
     return any(name not in BEFORE_THE_RUN and not name.startswith(PART) for name in names)
 
 
 @contextlib.contextmanager
 def _claimed(folder: Path) -> Iterator[None]:
-    """Keep other processes from training in a folder; remove it if nothing was written there.
+    """Keep other processes from training in a folder.
+
+    At the end, the folder is removed if no settings were written there.
 
     Raises:
-        ConfigError: if a process trains there already.
+        ConfigError: if another process already trains there.
     """
     lock = FileLock(folder / LOCK)
     try:
@@ -130,7 +133,7 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def new_run(config: Config) -> Iterator[Path]:
-    """Make the folder of a new run, and keep other processes from using it meanwhile.
+    """Make and yield the folder of a new run; other processes cannot use it until the block ends.
 
     The folder of a run that was killed before its first checkpoint may be used again.
 
@@ -155,28 +158,28 @@ def new_run(config: Config) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def run_to_resume(run: str) -> Iterator[Path]:
-    """Return the folder of a run to resume, and keep other processes from using it meanwhile.
+    """Yield the folder of a run to resume; other processes cannot use it until the block ends.
 
     Args:
         run: the run's folder, or its checkpoint.
 
     Raises:
-        ConfigError: if there is no run.
+        ConfigError: if there is no run to resume.
     """
     path = Path(run)
     if not path.is_dir() and not path.is_file():
-        raise ConfigError(f"{run}: no such checkpoint")
+        raise ConfigError(f"{run}: no such folder or checkpoint")
     folder = path if path.is_dir() else path.parent
     if path == folder and not (path / checkpoints.LATEST).exists():
-        if _holds_more(folder):
-            raise ConfigError(f"{run}: needs the folder of a run, with {checkpoints.LATEST}")
+        if _has_other_files(folder):
+            raise ConfigError(f"{run}: not the folder of a run: it has no {checkpoints.LATEST}")
         if not (folder / SETTINGS).exists():
-            raise ConfigError(f"{run}: no run has begun there; train it without --resume")
+            raise ConfigError(f"{run}: no run has begun there; begin one without --resume")
     with _claimed(folder):
         yield folder
 
 
-def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] | None]:
+def settings_to_resume(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] | None]:
     """Return the settings and the latest checkpoint of a run to resume.
 
     A run that was killed before its first checkpoint has no checkpoint: it begins again.
@@ -202,12 +205,12 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
         settings, _ = parse([f"--config={path.with_name(SETTINGS)}"])
     config, options = parse(["--config", yaml.safe_dump(settings.to_dict()), *arguments])
     if len(options.config or []) > 1:
-        raise ConfigError("--resume: needs no --config, as the run has its own settings")
-    before, after = settings.flat(), config.flat()
-    for key, value in after.items():
-        if value != before[key] and not key.startswith(MAY_CHANGE):
+        raise ConfigError("--config: not allowed with --resume, which uses the settings of the run")
+    stored = settings.flat()
+    for key, value in config.flat().items():
+        if value != stored[key] and not key.startswith(MAY_CHANGE):
             raise ConfigError(
-                f"--resume: the run has {key} = {before[key]}, not {value}; with --resume only "
+                f"--resume: the run has {key} = {stored[key]}, not {value}; with --resume only "
                 "output.*, evaluation.* and ppo.max_iterations may change"
             )
     done = 0
@@ -216,7 +219,8 @@ def resumed(run: str, arguments: Sequence[str]) -> tuple[Config, dict[str, Any] 
         done = checkpoint["iter"] + 1
     if config.ppo.max_iterations < min(done, settings.ppo.max_iterations):
         raise ConfigError(
-            f"ppo.max_iterations = {config.ppo.max_iterations}: the run has done {done} already"
+            f"ppo.max_iterations = {config.ppo.max_iterations}: the run has already finished "
+            f"{done} iterations"
         )
     return config, checkpoint
 
@@ -225,10 +229,10 @@ def _check_size(config: Config, checkpoint: Mapping[str, Any]) -> None:
     """Refuse settings that do not match the games in a checkpoint, before games are made.
 
     Raises:
-        ConfigError: if they do not match; names what is wrong.
+        ConfigError: if they do not match; the message names the setting.
     """
     states = checkpoint.get("state")
-    if not isinstance(states, list):  # the runner refuses it with the reason
+    if not isinstance(states, list):  # the runner refuses this checkpoint and says why
         return
     ppo = config.ppo
     try:
@@ -237,5 +241,8 @@ def _check_size(config: Config, checkpoint: Mapping[str, Any]) -> None:
     except ValueError as error:
         raise ConfigError(f"--resume: {error}") from None
     for state in states:
-        if state.get("game", {}).get("t", torch.empty(0)).numel() != ppo.num_envs:
-            raise ConfigError(f"--resume: ppo.num_envs = {ppo.num_envs}: the state has others")
+        games = state.get("game", {}).get("t", torch.empty(0)).numel()
+        if games != ppo.num_envs:
+            raise ConfigError(
+                f"--resume: ppo.num_envs = {ppo.num_envs}, but the checkpoint has {games} games"
+            )

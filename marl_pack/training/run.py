@@ -1,4 +1,4 @@
-"""Run a training until its end, or until it is stopped."""
+"""Train agents until the end of the run, or until the user stops it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from marl_pack.training.assembly import evaluation, make_runner, rank
 from marl_pack.training.display import Display
 from marl_pack.training.folder import (
     new_run,
-    resumed,
     run_to_resume,
+    settings_to_resume,
     write_history,
     write_record,
 )
@@ -39,7 +39,7 @@ def train(
         config: the settings of the run.
         folder: the folder of the run.
         console: the console that shows progress.
-        arguments: the words of the command line, for the run's record.
+        arguments: the words of the command line, which are stored in the run's record.
         checkpoint: the checkpoint of the run to resume.
 
     Raises:
@@ -78,7 +78,7 @@ def train(
         if rank() == 0:
             console.print("stopping after this iteration; a second signal stops at once")
 
-    before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:
         if display.live and rank() == 0:
             with display.view:
@@ -86,7 +86,7 @@ def train(
         else:
             runner.train(total)
     finally:
-        for kind, handler in before.items():
+        for kind, handler in handlers.items():
             signal.signal(kind, handler)
         if runner.is_distributed:
             torch.distributed.destroy_process_group()
@@ -98,11 +98,11 @@ def _progress(config: Config, done: int) -> str:
 
     Args:
         config: the settings of the run.
-        done: number of iterations that the run has done.
+        done: number of iterations that the run has finished.
     """
     total = config.ppo.max_iterations
     if done >= total:
-        return f", has done all its {total:,} iterations; --ppo.max_iterations extends it"
+        return f", has finished all its {total:,} iterations; --ppo.max_iterations extends it"
     return f", continues after iteration {done:,} of {total:,}" if done else ""
 
 
@@ -113,7 +113,7 @@ def start(
 
     Args:
         program: name of the command, for messages.
-        words: the words of the command line, for the run's record.
+        words: the words of the command line, which are stored in the run's record.
         config: the settings of a new run; None to resume a run.
         run: the folder of the run to resume, or its checkpoint.
         rest: the words of the command line without --resume.
@@ -129,7 +129,7 @@ def start(
         with claim as folder:
             checkpoint = None
             if config is None:
-                config, checkpoint = resumed(run, rest)
+                config, checkpoint = settings_to_resume(run, rest)
             done = 0 if checkpoint is None else checkpoint["iter"] + 1
             if rank() == 0:
                 console.print(f"run: {folder}{_progress(config, done)}", soft_wrap=True)
@@ -142,14 +142,15 @@ def start(
             )
         return 130
     except KeyboardInterrupt:
-        console.print("stopped at once; the last checkpoint is as it was")
+        console.print("stopped at once; the last checkpoint is unchanged")
         return 130
     except TrainingDivergedError as error:
         complain(program, error)
         return 1
     except (ConfigError, NotFiniteError, OSError, ModuleNotFoundError) as error:
+        # Some errors name no file, for example when logs cannot be written.
         nameless = isinstance(error, OSError) and error.errno and not error.filename
-        where = f"{folder}: " if nameless else ""  # for example when logs cannot be written
+        where = f"{folder}: " if nameless else ""
         complain(program, f"{where}{error}")
         return 2
     if rank() == 0:

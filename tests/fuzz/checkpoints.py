@@ -19,7 +19,7 @@ from marl_pack.config import from_dict
 from marl_pack.export import export_agent
 from marl_pack.game.packing import Packing
 from marl_pack.training.assembly import make_runner
-from marl_pack.training.folder import resumed
+from marl_pack.training.folder import settings_to_resume
 
 Path_ = tuple[Any, ...]
 
@@ -137,7 +137,7 @@ def freeze(path: Path) -> None:
 
 def resume(path: Path) -> None:
     """Make a runner that resumes from the file."""
-    config, checkpoint = resumed(str(path), [])
+    config, checkpoint = settings_to_resume(str(path), [])
     make_runner(config, None, checkpoint)
 
 

@@ -81,7 +81,7 @@ def outcome(process: BaseProcess, output: Path, case: Case) -> str:
         return "killed"
     refusals = [line for line in lines if line.startswith("python -m marl_pack.train: ")]
     if process.exitcode == 2 and len(lines) <= 2 and len(refusals) == 1:
-        for reason in ("another process trains", "no run has begun", "no such checkpoint"):
+        for reason in ("another process trains", "no run has begun", "no such folder"):
             if reason in refusals[0]:
                 return f"refused: {reason}"
     case.faults.append(f"exit {process.exitcode}: {lines[-1:]}")
