@@ -1,4 +1,4 @@
-"""The numbers by which heuristics compare the placements of the visible items."""
+"""Compute the numbers by which heuristics compare the placements of the visible items."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ class Candidates:
 
     @cached_property
     def _heights_and_waste(self) -> tuple[Tensor, Tensor]:
-        """Resting heights and wasted cells of every placement, computed together."""
+        """Resting height and number of wasted cells for every placement, computed together."""
         return self._windows(waste=True)
 
     @cached_property
     def z(self) -> Tensor:
-        """Resting heights, int64 [G, 6, W, D]."""
+        """Resting height of the item in cells, int64 [G, 6, W, D]."""
         if "_heights_and_waste" in vars(self):
             return self._heights_and_waste[0].long()
         return self._windows(waste=False)[0].long()
 
     @cached_property
     def waste(self) -> Tensor:
-        """Empty cells that would be enclosed below the item, int64 [G, 6, W, D]."""
+        """Number of empty cells that the item would enclose below itself, int64 [G, 6, W, D]."""
         return self._heights_and_waste[1].long()
 
     @cached_property
     def top(self) -> Tensor:
-        """Height of the item's top, at most H, int64 [G, 6, W, D]."""
+        """Height of the item's top in cells, at most H, int64 [G, 6, W, D]."""
         return (self.z + self.sides[..., 2, None, None]).clamp(max=self.size[2])
 
     @cached_property

@@ -1,7 +1,7 @@
-"""Heuristics: each ranks the legal placements by keys and takes the lowest.
+"""Heuristics: policies that rank the legal placements by keys and take the lowest.
 
-All use the same masks as the learned agents, so their packings are as stable. If two placements
-have equal keys, the first orientation is taken, then the first cell.
+They use the same masks as the learned agents, so their packings are as stable. If placements have
+equal keys, a heuristic takes the first orientation, then the first cell.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     """Return the policy called ``name``, for games on ``device``.
 
     Args:
-        name: a heuristic, or ``random``: uniform among the legal orientations, then uniform among
-            the cells of the chosen one.
-        seed: of the random choices; with None they come from torch's global generator.
+        name: a heuristic, or ``random``: it draws one of the legal orientations uniformly, then
+            one of the legal cells for this orientation.
+        seed: the seed of random choices; with None they come from torch's global generator.
         device: the device of the games.
 
     Raises:
@@ -89,7 +89,7 @@ def make_orientation_agent(
 ) -> OrientationAgent:
     """Return the orientation agent called ``name``: a heuristic, ``random`` or ``first``.
 
-    ``first`` leaves the item as it comes (orientation 0). If orientation 0 is not legal, it takes
+    ``first`` does not rotate the item (orientation 0). If orientation 0 is not legal, it takes
     the first legal orientation. The arguments are those of :func:`make_policy`, and ``lookahead``,
     which computes afterstates and may be shared with the other agent.
 

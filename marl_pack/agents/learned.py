@@ -22,7 +22,7 @@ class LearnedAgent:
     Args:
         kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         actor: the network.
-        lookahead: computes afterstates and their values; shared with the other agent.
+        lookahead: computes afterstates and their values; the agents of a policy share it.
         symmetric: whether to average the probabilities over the symmetries of the bin
             (:func:`marl_pack.agents.networks.symmetry.mean_probabilities`).
     """
@@ -60,7 +60,7 @@ class LearnedAgent:
 
 
 class JointPolicy:
-    """The policy of a learned joint agent, which chooses orientation and cell at once.
+    """The policy of a learned joint agent, which chooses orientation and cell together.
 
     Args:
         agent: the agent.
@@ -71,7 +71,7 @@ class JointPolicy:
 
     @torch.inference_mode()
     def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
-        """Return the most probable placement of each game, int64 [G] each.
+        """Return orientation and cell of each game's most probable placement, int64 [G] each.
 
         Args:
             game: the games.

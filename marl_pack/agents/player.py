@@ -1,4 +1,4 @@
-"""Load a policy by name and play with it: many games at once, or the environment by turns."""
+"""Load a policy by name; play many games at once with it, or one environment turn by turn."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def load(
     Args:
         source: a heuristic (:data:`marl_pack.agents.keys.POLICIES`), a published model such
             as ``"rs"``, the path of a run's folder or a checkpoint (a path contains a folder or a
-            dot: ``"./NAME"``), or ``"FILE.py:NAME"``, a function of your own.
+            dot: ``"./NAME"``), or ``"FILE.py:NAME"``, a function that you wrote.
         device: the device of the games; the environment plays on the CPU.
-        seed: of random play and of the futures that a search imagines; with None, random play uses
-            torch's global generator.
+        seed: the seed of random play and of the future items that a search draws; with None, random
+            play uses torch's global generator.
         symmetric: whether learned agents average over the symmetries of the bin.
-        search: how far learned agents search before each placement; None for no search. They
-            imagine items like the items of their training.
+        search: how far learned agents search before each placement; None for no search. Future
+            items are drawn from the distribution of the items in training.
 
     Raises:
         ValueError, FileNotFoundError: if there is no such player, or it does not support an option.
@@ -78,9 +78,9 @@ class Player:
     """A player of G games of :class:`marl_pack.game.packing.Packing`, or of the environment.
 
     Args:
-        policy: the policy that chooses, such as :meth:`marl_pack.agents.loading.Loader.policy`
-            returns. If a function of your own has to choose the cell alone, it is called with the
-            moves to choose among as its second argument.
+        policy: the policy that chooses, for example from
+            :meth:`marl_pack.agents.loading.Loader.policy`. If a function that you wrote has to
+            choose the cell alone, its second argument is the moves to choose among.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -94,7 +94,7 @@ class Player:
     def act(self, env: Any) -> Any:
         """Return the action of the agent whose turn it is, for ``env.step``.
 
-        The placement agent uses the chosen orientation, also if another player chose it.
+        The placement agent uses the chosen orientation, even if another player chose it.
 
         Args:
             env: an environment of :mod:`marl_pack.env_aec`, with or without wrappers.
@@ -104,7 +104,7 @@ class Player:
             dict with the actions that its ``step`` needs.
 
         Raises:
-            ValueError: for another environment, or if no agent is left to act.
+            ValueError: if this is another environment, or if no agent is left to act.
         """
         raw = getattr(env, "unwrapped", None)
         if not isinstance(raw, raw_env):
@@ -123,7 +123,7 @@ class Player:
 
 
 class _TwoTurns:
-    """The two agents of a policy that chooses orientation and cell at once.
+    """The two agents of a policy that chooses orientation and cell together.
 
     Args:
         policy: a policy that also accepts the moves to choose among, as its second argument.
@@ -135,7 +135,7 @@ class _TwoTurns:
         self._choice: Placement
 
     def orientation_agent(self, game: Packing) -> Tensor:
-        """Choose both, and return the orientations, int64 [G]."""
+        """Choose orientations and cells, and return the orientations, int64 [G]."""
         self._turn, self._choice = game.turn, self.policy(game)
         return self._choice[0]
 

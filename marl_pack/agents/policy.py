@@ -47,12 +47,12 @@ def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:
 
     Args:
         mask: bool [G, K].
-        generator: of random numbers, on the mask's device; torch's global generator by default.
+        generator: of random numbers on the mask's device; torch's global generator by default.
 
     Returns:
         int64 [G].
     """
-    # Inverse CDF: several times cheaper than torch.multinomial.
+    # The inverse of the cumulative counts is several times faster than torch.multinomial.
     count = mask.cumsum(1, dtype=torch.int32)
     point = torch.rand(len(mask), 1, generator=generator, device=mask.device)
     rank = (point * count[:, -1:]).to(torch.int32)

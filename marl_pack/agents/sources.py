@@ -1,4 +1,4 @@
-"""Find the files of policies: published models, checkpoints, folders of runs, and your own code."""
+"""Find the files of policies: published models, checkpoints, folders of runs, and user code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from marl_pack import published, renamed
 
 LATEST, BEST = "latest.pt", "best.pt"
-"""Checkpoints in a run's folder: the latest, to resume from, and the best in evaluation."""
+"""Checkpoints in a run's folder: the latest, to resume the run, and the best in evaluation."""
 
 
 OWN = re.compile(r"(.+\.py):([A-Za-z_]\w*)")
@@ -81,7 +81,7 @@ def path_of(source: str | Path, names: Sequence[str]) -> Path:
 
     Args:
         source: a published model's name, or a path.
-        names: the heuristics that are also valid here, for the message.
+        names: the heuristics that are also valid here; the message names them.
 
     Raises:
         ValueError: if ``source`` is neither a path nor the name of a published model.
@@ -95,11 +95,11 @@ def resolve(source: str | Path) -> Path:
 
     Args:
         source: a published model's name, or the path of a checkpoint or of a run's folder. In a
-            folder, ``best.pt`` is taken; ``latest.pt`` if there is no best.
+            folder it is ``best.pt``, or ``latest.pt`` if there is no ``best.pt``.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: for a name that no published model has.
+        ValueError: if no published model has this name.
     """
     path = published.model(source)
     if path.is_dir():

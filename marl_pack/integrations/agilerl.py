@@ -1,8 +1,8 @@
-"""AgileRL: the masked actor-critic as two networks, and observations that contain the mask.
+"""Adapt the actor-critic and the observations to AgileRL.
 
 AgileRL reads masks from ``info["action_mask"]`` and does not use them when it learns. So here the
-mask is in the observation, under the name ``legal`` (AgileRL refuses ``action_mask`` there), and
-the networks apply it, also when learning.
+observation contains the mask, under the name ``legal`` (AgileRL refuses the name ``action_mask``
+there), and the networks apply it in play and in learning.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ class Masked(EvolvableModule):
 
     Args:
         agent: name of the agent, ``"orientation_0"`` or ``"placement_0"``.
-        device: where its weights are.
+        device: the device of the weights.
     """
 
     def __init__(self, agent: str, device: str = "cpu") -> None:
         super().__init__(device)
         self.agent = agent
         self.network = ActorCritic(agent.partition("_")[0])
-        self.choice: Any = None  # distribution of actions for the last observation
+        self.distribution: Any = None  # distribution of actions for the last observation
 
     def outputs(self, observation: Any) -> tuple[torch.Tensor, torch.Tensor]:
         """Return masked logits [B, n] and values [B]."""
@@ -42,18 +42,18 @@ class Actor(Masked):
 
     def forward(self, observation: Any, action_mask: Any = None) -> tuple[torch.Tensor, ...]:
         """Return actions, their log-probabilities and entropies; each [B]."""
-        self.choice = Categorical(logits=self.outputs(observation)[0])
-        action = self.choice.sample()
-        return action, self.choice.log_prob(action), self.choice.entropy()
+        self.distribution = Categorical(logits=self.outputs(observation)[0])
+        action = self.distribution.sample()
+        return action, self.distribution.log_prob(action), self.distribution.entropy()
 
     def action_log_prob(self, action: torch.Tensor) -> torch.Tensor:
-        """Return log-probabilities [B] of actions, for the last observation."""
-        log_prob: torch.Tensor = self.choice.log_prob(action)
+        """Return the log-probabilities [B] of actions for the last observation."""
+        log_prob: torch.Tensor = self.distribution.log_prob(action)
         return log_prob
 
 
 class Critic(Masked):
-    """The network that values states."""
+    """The network that estimates the values of states."""
 
     def forward(self, observation: Any) -> torch.Tensor:
         """Return the values of states, [B, 1]."""
@@ -68,6 +68,6 @@ def legal_space(space: Any) -> spaces.Dict:
 def renamed(observations: dict[str, Any]) -> dict[str, Any]:
     """Return observations as batches of size 1, with the mask under the name ``legal``."""
     return {
-        agent: {"observation": own["observation"][None], "legal": own["action_mask"][None]}
-        for agent, own in observations.items()
+        agent: {"observation": entry["observation"][None], "legal": entry["action_mask"][None]}
+        for agent, entry in observations.items()
     }

@@ -1,4 +1,4 @@
-"""BenchMARL: the environment as a task, and the masked actor-critic as a model."""
+"""Adapt the environment and the actor-critic to BenchMARL, as a task and a model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class PackingTask(PettingZooClass):
-    """The AEC environment as a task in which every agent is a group, with exact masks.
+    """The AEC environment as a task with exact masks, in which each agent is a group.
 
     Example: ``PackingTask("PACKING", {"bin_size": (10, 10, 10)})``. The settings are the arguments
     of :func:`marl_pack.env_aec.env`.
@@ -29,7 +29,7 @@ class PackingTask(PettingZooClass):
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: Any, device: Any) -> Any:
         """Return a function that makes environments, each with its own items.
 
-        BenchMARL gives all environments of a task the same seed, so here each gets the next seed.
+        BenchMARL gives all environments of a task the same seed, so here each gets a new seed.
         """
         seeds = count(1000 * (seed or 0))
         return lambda: PettingZooWrapper(
@@ -42,11 +42,11 @@ class PackingTask(PettingZooClass):
         return True
 
     def max_steps(self, env: Any) -> int:
-        """Return a limit that no evaluation reaches, as episodes end by themselves."""
+        """Return a limit that no evaluation reaches: every episode ends before it."""
         return 10**6
 
     def observation_spec(self, env: Any) -> Any:
-        """Return what the model reads: planes, mask of actions, and whether the agent acts."""
+        """Return the spec of the model's inputs: planes, mask, and whether the agent acts."""
         spec = env.observation_spec.clone()
         for group in self.group_map(env):
             del spec[group]["info"]
@@ -56,8 +56,8 @@ class PackingTask(PettingZooClass):
 class MaskedModel(Model):
     """An :class:`ActorCritic` with BenchMARL's interface; as a critic it returns values.
 
-    BenchMARL's losses also include the turns of the other agent. Logits are constant there, so
-    that no gradient reaches the policy. The critic learns the values of these turns.
+    BenchMARL's losses also include the turns of the other agent. In these turns the logits are
+    constant, so that no gradient reaches the policy. The critic learns the values of these turns.
     """
 
     def __init__(self, **arguments: Any) -> None:
@@ -82,7 +82,7 @@ class MaskedModel(Model):
 
 @dataclass
 class MaskedModelConfig(ModelConfig):
-    """The settings of :class:`MaskedModel`, which has none."""
+    """The settings of :class:`MaskedModel`: there are none, but BenchMARL needs the class."""
 
     @staticmethod
     def associated_class() -> type[Model]:

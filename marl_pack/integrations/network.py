@@ -1,7 +1,7 @@
 """A small masked actor-critic for the PettingZoo environment, in plain PyTorch.
 
-It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. Copy it and change
-it. The agents of ``marl-pack train`` are larger and observe more.
+It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. You may copy and
+change it. The agents of ``marl-pack train`` are larger and observe more.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 FORBIDDEN = -1e9
-"""Logit of an action that is not legal: finite, so that no entropy or KL becomes NaN."""
+"""Logit of an action that is not legal. It is finite, so that no entropy or KL becomes NaN."""
 
 SCORES = {"orientation": (True, False), "placement": (False, True), "both": (True, True)}
 """For each agent: whether its network scores orientations, and whether it scores cells."""

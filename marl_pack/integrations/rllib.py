@@ -1,4 +1,4 @@
-"""RLlib, new API stack: the masked actor-critic as an RLModule."""
+"""Adapt the actor-critic to RLlib (new API stack), as an RLModule."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class MaskedModule(TorchRLModule, ValueFunctionAPI):
-    """An :class:`ActorCritic` with RLlib's interface; ``model_config={"agent": "orientation"}``.
+    """An :class:`ActorCritic` with RLlib's interface.
 
-    It reads the mask from the observation. Connectors ask for values through ``ValueFunctionAPI``.
+    Example: ``model_config={"agent": "orientation"}``. The network reads the mask from the
+    observation. RLlib's connectors get values through ``ValueFunctionAPI``.
     """
 
     def setup(self) -> None:

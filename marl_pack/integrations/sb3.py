@@ -1,4 +1,7 @@
-"""Stable-Baselines3 (sb3-contrib): one agent for both turns, and the masked policy."""
+"""Adapt the environment and the actor-critic to Stable-Baselines3 (sb3-contrib).
+
+One agent plays both turns, so that MaskablePPO can train it.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +20,14 @@ from marl_pack.integrations.network import ActorCritic
 
 
 class Turns(Copied, gymnasium.Env[Any, Any]):
-    """A Gymnasium environment whose single agent plays both turns for the shared reward.
+    """A Gymnasium environment whose single agent plays the turns of both agents.
+
+    The orientation agent's turn and the placement agent's turn are two steps; the reward is the one
+    that both agents share.
 
     Args:
         env: an AEC environment with ``pad_actions=True``.
-        seed: seed of the items, which the first reset uses.
+        seed: seed of the items; the first call of :meth:`reset` uses it.
     """
 
     def __init__(self, env: Any, seed: int) -> None:
@@ -31,13 +37,16 @@ class Turns(Copied, gymnasium.Env[Any, Any]):
         self.action_space = env.action_space(AGENTS[0])
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Begin the stream's next episode; return the observation and an empty info."""
+        """Begin the next episode of the stream of items; return its observation and an empty info.
+
+        The arguments are ignored: the environment has its seed already.
+        """
         self.env.reset(seed=self.seed)
         self.seed = None
         return self.env.observe(self.env.agent_selection), {}
 
     def step(self, action: Any) -> Any:
-        """Play the turn of the agent that acts; return what gymnasium's ``step`` does."""
+        """Play one turn; return the same five values as ``step`` of Gymnasium."""
         agent = self.env.agent_selection
         self.env.step(action)
         ends = self.env.terminations[agent], self.env.truncations[agent]
@@ -51,9 +60,10 @@ class Turns(Copied, gymnasium.Env[Any, Any]):
 
 
 class MaskedPolicy(MaskableMultiInputActorCriticPolicy):
-    """A policy that is one :class:`ActorCritic` for both turns.
+    """A policy with one :class:`ActorCritic` for both turns.
 
-    MaskablePPO asks for values without a mask, so the policy reads the mask from the observation.
+    MaskablePPO passes no mask when it asks for the values of states, so the policy reads the mask
+    from the observation.
     """
 
     def _build(self, lr_schedule: Any) -> None:
@@ -62,23 +72,23 @@ class MaskedPolicy(MaskableMultiInputActorCriticPolicy):
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr_schedule(1))
 
     def _outputs(self, obs: Any, action_masks: Any = None) -> tuple[Any, Tensor]:
-        """Return the distribution of actions and values [B, 1]."""
+        """Return the distribution of actions, and the values [B, 1]."""
         logits, values = self.network(obs["observation"].float(), obs["action_mask"])
-        choice = self.action_dist.proba_distribution(action_logits=logits)
+        distribution = self.action_dist.proba_distribution(action_logits=logits)
         if action_masks is not None:
-            choice.apply_masking(action_masks)
-        return choice, values[:, None]
+            distribution.apply_masking(action_masks)
+        return distribution, values[:, None]
 
     def forward(self, obs: Any, deterministic: bool = False, action_masks: Any = None) -> Any:
         """Return actions, values and log-probabilities."""
-        choice, values = self._outputs(obs, action_masks)
-        actions = choice.get_actions(deterministic=deterministic)
-        return actions, values, choice.log_prob(actions)
+        distribution, values = self._outputs(obs, action_masks)
+        actions = distribution.get_actions(deterministic=deterministic)
+        return actions, values, distribution.log_prob(actions)
 
     def evaluate_actions(self, obs: Any, actions: Tensor, action_masks: Any = None) -> Any:
         """Return values, log-probabilities and entropies of actions."""
-        choice, values = self._outputs(obs, action_masks)
-        return values, choice.log_prob(actions), choice.entropy()
+        distribution, values = self._outputs(obs, action_masks)
+        return values, distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, obs: Any, action_masks: Any = None) -> Any:
         """Return the distribution of actions."""

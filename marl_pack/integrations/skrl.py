@@ -1,4 +1,4 @@
-"""skrl: the masked actor-critic as a model, policy and value in one."""
+"""Adapt the actor-critic to skrl, as one model for policy and value."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class MaskedModel(CategoricalMixin, DeterministicMixin, Model):
         self.network = ActorCritic(agent.partition("_")[0])
 
     def act(self, inputs: dict[str, Any], *, role: str = "") -> Any:
-        """Call ``act`` of the mixin for this role."""
+        """Call the method ``act`` of the mixin for this role."""
         mixin = CategoricalMixin if role == "policy" else DeterministicMixin
         return mixin.act(self, inputs, role=role)
 

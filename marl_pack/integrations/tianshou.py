@@ -1,4 +1,4 @@
-"""Tianshou: the masked actor-critic as two networks, and PPO on each agent's own turns."""
+"""Adapt the actor-critic to Tianshou, and train each agent on its own turns only."""
 
 from __future__ import annotations
 
@@ -46,28 +46,30 @@ class Critic(nn.Module):
 
 
 class OwnTurns(MultiAgentOnPolicyAlgorithm):
-    """The learners of several agents, each of which learns from its own turns only.
+    """The learners of both agents, each of which learns from its own turns only.
 
     Tianshou treats every turn as a step. Here an agent's reward is the sum of its rewards until
-    its next turn, and its next observation is the observation at its next turn.
+    its next turn, and its next observation is its observation in that turn.
     """
 
     def _preprocess_batch(self, batch: Any, buffer: Any, indices: Any) -> Any:
-        """Return the batch for each agent's learner, by the agent's name."""
+        """Return a batch for the learner of each agent, by the agent's name."""
         batches = {}
         for column, agent in enumerate(AGENTS):
-            own = np.flatnonzero(batch.obs.agent_id == agent)
-            other = np.minimum(own + 1, len(batch.done) - 1)  # the turn after it, if there is one
-            goes_on = ~batch.done[own] & (other > own)
+            own_turns = np.flatnonzero(batch.obs.agent_id == agent)
+            # The other agent's turn is next, unless the batch ends.
+            next_turns = np.minimum(own_turns + 1, len(batch.done) - 1)
+            goes_on = ~batch.done[own_turns] & (next_turns > own_turns)
             turns = ReplayBuffer.from_data(
-                obs=batch.obs[own], act=batch.act[own],
-                rew=batch.rew[own, column] + np.where(goes_on, batch.rew[other, column], 0),
-                terminated=batch.terminated[own] | (goes_on & batch.terminated[other]),
-                truncated=batch.truncated[own] | (goes_on & batch.truncated[other]),
-                done=batch.done[own] | (goes_on & batch.done[other]),
-                obs_next=batch.obs_next[np.where(goes_on, other, own)],
+                obs=batch.obs[own_turns], act=batch.act[own_turns],
+                rew=batch.rew[own_turns, column]
+                + np.where(goes_on, batch.rew[next_turns, column], 0),
+                terminated=batch.terminated[own_turns] | (goes_on & batch.terminated[next_turns]),
+                truncated=batch.truncated[own_turns] | (goes_on & batch.truncated[next_turns]),
+                done=batch.done[own_turns] | (goes_on & batch.done[next_turns]),
+                obs_next=batch.obs_next[np.where(goes_on, next_turns, own_turns)],
             )  # fmt: skip
-            every = np.arange(len(own))
+            indices = np.arange(len(own_turns))
             learner = self.get_algorithm(agent)
-            batches[agent] = learner._preprocess_batch(turns[every], turns, every)
+            batches[agent] = learner._preprocess_batch(turns[indices], turns, indices)
         return Batch(batches)

@@ -1,4 +1,4 @@
-"""TorchRL: the masked actor-critic as modules that accept any leading dimensions."""
+"""Adapt the actor-critic to TorchRL, as modules that accept any leading dimensions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from marl_pack.integrations.network import ActorCritic
 class Part(torch.nn.Module):
     """A module that returns one of a network's two outputs, for any leading dimensions.
 
-    TorchRL adds a dimension of agents. In the other agent's turn TorchRL's mask is full. Here it is
-    replaced by an empty mask, so that logits are constant and no gradient reaches the policy from
-    that turn. The critic learns the value of that turn.
+    TorchRL adds a dimension of agents. In the other agent's turn, TorchRL's mask allows every
+    action. Here an empty mask replaces it, so that logits are constant and no gradient reaches the
+    policy from that turn. The critic learns the value of that turn.
 
     Args:
         network: the actor-critic.
