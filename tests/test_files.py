@@ -232,7 +232,7 @@ def test_an_interrupted_judge_keeps_what_is_finished(
                 assert command.main(["controls", "--json", str(out)]) == 130
             report = json.loads(out.read_text())
             assert (report["complete"], len(report["controls"])) == (False, judged)
-            assert "judged correctly: " in capsys.readouterr().out
+            assert "correct verdicts: " in capsys.readouterr().out
 
 
 def test_figures_are_written_though_nobody_reads_the_output(

@@ -1,8 +1,11 @@
 """Judge stacks in physics: the command ``marl-pack judge``.
 
-- ``table1``: the paper's Table 1, objects placed at random under a stability rule;
-- ``controls``: stacks with a known verdict, and the margins at which the judge's verdict flips;
-- ``stack FILE``: packings saved by ``marl-pack evaluate --save-stacks``; also pictures and films.
+- ``table1``: measure the paper's Table 1, for objects placed at random under a stability rule;
+- ``controls``: judge stacks with a known verdict, and find the margins at which the judge's verdict
+  flips;
+- ``stack FILE``: judge packings saved by ``marl-pack evaluate --save-stacks``, or draw one of them.
+
+``python -m marl_pack.sapien_check`` is the same command.
 """
 
 from __future__ import annotations
@@ -62,14 +65,14 @@ def run_table1(options: argparse.Namespace, console: Console) -> None:
             growing.update(report)
     finally:
         if rows:
-            title = f"Table 1, {options.objects:,} objects a rule, seed {options.seed}"
+            title = f"Table 1, {options.objects:,} objects per rule, seed {options.seed}"
             show_table1(rows, console, title)
 
 
 def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterator[dict[str, Any]]:
-    """Play and judge one rule; yield its row of the table after each bin.
+    """Fill bins under one rule and judge them; yield the rule's row of the table after each bin.
 
-    With ``--save-falls`` the bins in which something fell are saved.
+    With ``--save-falls``, also save the bins in which something fell.
     """
     task = bar.add_task(f"{rule}: objects", total=options.objects)
     path = options.save_falls and falls_file(options.save_falls, rule)
@@ -90,7 +93,7 @@ def judged_rule(rule: str, options: argparse.Namespace, bar: Progress) -> Iterat
 
 
 def falls_file(path: Path, rule: str) -> Path:
-    """Return the path of the file with the bins in which something fell under one rule."""
+    """Return the path of the file for the bins in which something fell under one rule."""
     return path.with_name(f"{path.name.removesuffix('.npz')}_{rule}.npz")
 
 
@@ -118,9 +121,10 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
             )
     console.print(table)
     console.print(
-        "unst.: falls whose stack is unstable by the exact equilibrium; stood: stacks that\n"
-        "are unstable by it and did not fall; masks s, s each: seconds for all masks and\n"
-        "for one mask; judge: seconds for one verdict (CPU time; as the paper reports it)"
+        "unst.: falls of stacks that the exact equilibrium calls unstable; stood: stacks that\n"
+        "it calls unstable and that did not fall; masks s, s each: CPU time in seconds for\n"
+        "all masks and for one mask; judge: CPU time in seconds for one verdict.\n"
+        "Rows of the paper: the figures that it reports."
     )
 
 
@@ -128,7 +132,7 @@ def show_table1(rows: dict[str, dict[str, Any]], console: Console, title: str) -
 
 
 def run_controls(options: argparse.Namespace, console: Console) -> bool:
-    """Judge the controls and print them; return whether all verdicts are correct."""
+    """Judge and print the controls; return whether all verdicts of the judge are correct."""
     cases = controls.cases()
     outcomes: list[controls.Outcome] = []
     flips: dict[str, float] = {}
@@ -173,16 +177,16 @@ def show_controls(
         flips: name of a family -> margin in millimetres at which the verdict flips.
         console: the console to print to.
     """
-    right = {of: sum(getattr(o, of) == o.known for o in outcomes)
+    correct = {of: sum(getattr(o, of) == o.known for o in outcomes)
              for of in ("judge", "equilibrium", "everything")}  # fmt: skip
     table = Table(title="controls: + stands, - falls", box=box.SIMPLE, pad_edge=False)
     table.add_column("stack", no_wrap=True)
-    for column in ("known", "judge", "exact", "all meet", "flips, mm"):
+    for column in ("known", "judge", "exact", "collide", "flips, mm"):
         table.add_column(column, justify="right", no_wrap=True)
     for name in dict.fromkeys(o.name for o in outcomes):
-        own = [o for o in outcomes if o.name == name]
+        stacks = [o for o in outcomes if o.name == name]
         signs = [
-            "".join("+" if getattr(o, of) else "-" for o in own)
+            "".join("+" if getattr(o, of) else "-" for o in stacks)
             for of in ("known", "judge", "equilibrium", "everything")
         ]
         at = flips.get(name)
@@ -191,10 +195,11 @@ def show_controls(
     console.print(table)
     margins = ", ".join(f"{m:+g}" for m in controls.MARGINS)
     console.print(
-        f"{len(outcomes)} controls, the decisive centre {margins} mm inside its support;\n"
-        f"judged correctly: {right['judge']}; by the exact equilibrium {right['equilibrium']}; "
-        f"if all boxes and walls collide {right['everything']}\n"
-        "flips: how far inside the centre is when the judge's verdict changes"
+        f"{len(outcomes)} controls, {margins} mm between the deciding centre of mass and the\n"
+        "edge of its support (negative: outside);\n"
+        f"correct verdicts: judge {correct['judge']}; exact equilibrium {correct['equilibrium']}; "
+        f"judge if all boxes and walls collide {correct['everything']}\n"
+        "flips: how far the centre of mass lies inside its support when the judge's verdict changes"
     )
 
 
@@ -202,7 +207,7 @@ def show_controls(
 
 
 def run_stack(options: argparse.Namespace, console: Console) -> None:
-    """Judge saved packings, print and write the verdicts, and draw one of the packings."""
+    """Draw one saved packing (``--render``), judge packings, and print and write the verdicts."""
     plans = load_plans(options.file)
     bodies = chosen_bodies(options)
     every = range(len(plans))
@@ -212,7 +217,7 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
             raise ValueError(f"--episodes {e}: needs numbers from 0 to {len(every) - 1}")
     if options.render is not None:
         if len(chosen) != 1:
-            raise ValueError("--render: needs one stack; name it by --episodes K")
+            raise ValueError("--render: needs one stack; choose it with --episodes K")
         title = f"{options.file.stem}, episode {chosen[0]}"
         draw(bodies.stack(plans[chosen[0]], chosen[0]), title, options, console)
     judged: dict[int, Judged] = {}
@@ -249,7 +254,7 @@ def stack_report(
 
 
 def show_judged(judged: dict[int, Judged], console: Console) -> None:
-    """Print the first falls and errors, and how many there are.
+    """Print the first falls and errors, and the numbers of all.
 
     Args:
         judged: number of an episode -> its result.
@@ -259,7 +264,7 @@ def show_judged(judged: dict[int, Judged], console: Console) -> None:
     for e, fall in list(falls.items())[:20]:
         console.print(f"episode {e}: {in_words(fall)}", soft_wrap=True)
     if len(falls) > 20:
-        console.print(f"… and {len(falls) - 20} more (--json keeps all)")
+        console.print(f"… and {len(falls) - 20} more (--json writes all)")
     errors = {e: j.error for e, j in judged.items() if j.error is not None}
     for e, error in list(errors.items())[:20]:
         console.print(f"episode {e}: no verdict: {error}", soft_wrap=True)
@@ -268,18 +273,18 @@ def show_judged(judged: dict[int, Judged], console: Console) -> None:
     console.print(
         f"{len(judged):,} packings, {placements:,} placements judged, {len(falls)} fell, "
         f"{len(errors)} without a verdict; "
-        f"{seconds / max(placements, 1):.3f} s a placement",
+        f"{seconds / max(placements, 1):.3f} s per placement",
         soft_wrap=True,
     )
 
 
 def in_words(fall: Verdict) -> str:
     """Describe a fall: the box placed last, and the box that rotated most."""
-    farthest = max(fall.moved, key=lambda i: fall.angle[i])
+    box_index = max(fall.moved, key=lambda i: fall.angle[i])
     others = f" and {len(fall.moved) - 1} more" if len(fall.moved) > 1 else ""
     return (
-        f"placing box {len(fall.distance) - 1} moved box {farthest} by "
-        f"{1000 * fall.distance[farthest]:.1f} mm and {fall.angle[farthest]:.1f}°{others}"
+        f"placing box {len(fall.distance) - 1} moved box {box_index} by "
+        f"{1000 * fall.distance[box_index]:.1f} mm and {fall.angle[box_index]:.1f}°{others}"
     )
 
 
@@ -293,8 +298,11 @@ def draw(stack: Stack, title: str, options: argparse.Namespace, console: Console
             stack, options.render, title, options.physics,
             lambda boxes: bar.update(task, completed=boxes),
         )  # fmt: skip
-    state = f"box {', '.join(map(str, frame.moved))} moved" if frame.moved else "nothing moved"
-    console.print(f"{options.render}: all boxes and walls collide; {state}", soft_wrap=True)
+    moved = ", ".join(map(str, frame.moved))
+    state = f"moved boxes: {moved}" if frame.moved else "no box moved"
+    console.print(
+        f"{options.render}: {state} (in the film all boxes and walls collide)", soft_wrap=True
+    )
 
 
 # --- the command ----------------------------------------------------------------------------------
@@ -313,49 +321,49 @@ def parser(program: str = PROGRAM) -> Parser:
         ),
     )
     commands = options.add_subparsers(dest="command", required=True)
-    shared = Parser(add_help=False)
-    add = shared.add_argument_group("physics").add_argument
+    common = Parser(add_help=False)
+    add = common.add_argument_group("physics").add_argument
     add("--friction", type=float, default=DEFAULT.friction,
         help=f"friction between all faces (default: {DEFAULT.friction})")  # fmt: skip
     add("--everything", action="store_true",
-        help="let all boxes and the walls collide, as in a real bin: neighbours then prop up boxes "
-             "that would fall")  # fmt: skip
-    add = shared.add_argument_group("output").add_argument
-    add("--json", type=Path, metavar="FILE", help="write the figures to this file")
-    several = Parser(add_help=False)
+        help="let all boxes and the walls collide, as in a real bin; then neighbours may prop up "
+             "boxes that would fall")  # fmt: skip
+    add = common.add_argument_group("output").add_argument
+    add("--json", type=Path, metavar="FILE", help="write the results to this file")
+    parallel = Parser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     hint = f"processes that work at once (default: 1; this computer has {cores} cores)"
-    several.add_argument_group("computation").add_argument(
+    parallel.add_argument_group("computation").add_argument(
         "--processes", type=int, default=1, help=hint
     )
 
-    first = commands.add_parser(
-        "table1", parents=[shared, several], help="the paper's Table 1",
+    table = commands.add_parser(
+        "table1", parents=[common, parallel], help="the paper's Table 1",
         description=table1.__doc__,
         examples=("--objects 300", "--rules hull_1 hull_alpha lbcp --json table1.json"),
     )  # fmt: skip
-    add = first.add_argument_group("objects").add_argument
+    add = table.add_argument_group("objects").add_argument
     add("--rules", nargs="+", choices=list(RULES), default=["hull_1", "hull_alpha"],
         help="stability rules (default: the paper's two)")  # fmt: skip
     add("--objects", type=int, default=3000,
         help="number of objects placed under each rule (default: 3000)")  # fmt: skip
     add("--seed", type=int, default=0, help="seed of objects and cells (default: 0)")
     add("--save-falls", type=Path, metavar="FILE",
-        help="save the bins in which something fell as FILE_RULE.npz, for the command "
-             "stack")  # fmt: skip
+        help="save the bins in which something fell as FILE_RULE.npz; judge stack reads "
+             "these files")  # fmt: skip
 
     commands.add_parser(
-        "controls", parents=[shared], help="stacks with a known verdict",
+        "controls", parents=[common], help="stacks with a known verdict",
         description=controls.__doc__, examples=("--json controls.json",),
     )  # fmt: skip
 
     stack = commands.add_parser(
-        "stack", parents=[shared, several], help="packings saved by evaluate --save-stacks",
+        "stack", parents=[common, parallel], help="packings saved by evaluate --save-stacks",
         description="Judge saved packings after each of their placements.",
         examples=("plans.npz --processes 2", "plans.csv --episodes 3 --render film.mp4"),
     )  # fmt: skip
     stack.add_argument(
-        "file", type=Path, help="a file of evaluate --save-stacks or play --save"
+        "file", type=Path, help="a file written by evaluate --save-stacks or play --save"
     )  # fmt: skip
     stack.add_argument(
         "--episodes", nargs="+", type=int, metavar="K",
@@ -364,11 +372,14 @@ def parser(program: str = PROGRAM) -> Parser:
     bodies = stack.add_argument_group("bodies")
     add_body_options(bodies)
     bodies.add_argument(
-        "--seed", type=int, default=0, help="seed of drawn densities and centres (default: 0)"
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of random densities and centres of mass (default: 0)",
     )
     add = stack.add_argument_group("film").add_argument
     add("--render", type=Path, metavar="FILE",
-        help="show the stack being built: a film (.mp4, .gif) or its end (.png)")  # fmt: skip
+        help="draw the stack being built, as a film (.mp4, .gif), or its end (.png)")  # fmt: skip
     return options
 
 

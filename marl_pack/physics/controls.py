@@ -1,7 +1,9 @@
-"""Stacks that test the judge: by statics it is known whether each stands or falls.
+"""Test the judge with controls: stacks for which statics tells whether they stand or fall.
 
-Each family has a margin in millimetres: how far the decisive centre of mass lies inside its support
-(positive: the stack stands; negative: it falls). The exact equilibrium is computed as well.
+The judge simulates a stack in physics. Most controls belong to a family of stacks with a margin in
+millimetres. One centre of mass decides whether the stack stands; the margin says how far inside its
+support this centre lies. If the margin is positive, the stack stands. If it is negative, the centre
+lies outside and the stack falls. The exact equilibrium is computed as well.
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ from marl_pack.sapien_check.stack import DENSITY, Stack
 from marl_pack.sapien_check.world import DEFAULT, Physics
 
 MARGINS = (1.0, 0.2, -0.2, -1.0)
-"""Millimetres inside the support at which every family is judged."""
+"""Margins in millimetres at which every family is judged; negative ones are outside the support."""
 
 SCALE = 1000
-"""Cells per millimetre for the exact equilibrium, which takes whole cells."""
+"""Number of cells in a millimetre, for the exact equilibrium, which needs whole cells."""
 
 WIDEST = 8.0  # millimetres; largest margin at which a flip of the verdict is searched for
 BIN = (1000.0, 1000.0, 2000.0)  # millimetres, so that no wall is near
 
 
 def exact_equilibrium(plan: Plan) -> bool:
-    """Return whether a plan in millimetres is in strict static equilibrium, to 1/1000 mm."""
+    """Return whether a plan in millimetres, rounded to 1/1000 mm, is in strict equilibrium."""
     from marl_pack.stability import in_equilibrium
 
     boxes = np.rint(plan.boxes * SCALE).astype(np.int64)
@@ -43,13 +45,13 @@ def _plan(
     mass: tuple[float, ...] | None = None,
     last_centre: tuple[float, float] = (0.0, 0.0),
 ) -> Plan:
-    """Return boxes in millimetres and kilograms, moved into the middle of the bin.
+    """Return a plan of boxes in millimetres and kilograms, 300 mm from two walls of the bin.
 
     Args:
         rows: x, y, z, w, d, h of each box.
         mass: kilograms of each box; by default the mass of filled cartons.
-        last_centre: x, y of the last box's centre of mass from its middle; the other boxes have
-            their centre of mass in the middle.
+        last_centre: x and y of the last box's centre of mass minus those of its middle; the other
+            boxes have their centre of mass in the middle.
     """
     boxes = np.array(rows, np.float64)
     boxes[:, :2] += 300.0 - boxes[:, :2].min(0)
@@ -60,14 +62,15 @@ def _plan(
 
 
 def cube(edge: float, margin: float) -> Plan:
-    """Return two cubes: half of the upper cube is over the edge of the lower one."""
+    """Return two cubes: about half of the upper one protrudes over the edge of the lower one."""
     return _plan((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
 
 
 def heavy_on_light(ratio: float, margin: float) -> Plan:
-    """Return the stack of the paper's figure: a heavier box stands on the end of a light overhang.
+    """Return the stack in the paper's figure: a box on the protruding end of a light box.
 
-    The decisive centre of mass is that of both boxes together.
+    The centre of mass that decides is the common centre of these two boxes. The upper box has
+    ``ratio`` times the mass of the light box.
     """
     middle = ((200 - margin) * (1 + ratio) - 150) / ratio
     return _plan(
@@ -77,18 +80,22 @@ def heavy_on_light(ratio: float, margin: float) -> Plan:
 
 
 def harmonic(count: int, margin: float) -> Plan:
-    """Return an overhang of planks: each is 5 mm inside its limit, the lowest by the margin."""
+    """Return an overhang of ``count`` planks.
+
+    All planks above a plank have their common centre of mass 5 mm inside its edge; for the lowest
+    plank the margin takes the place of the 5 mm.
+    """
     length, rows, centre = 300.0, [(0.0, 0.0, 50.0 * (count - 1), 300.0, 100.0, 50.0)], 150.0
     for above in range(1, count):
         slack = margin if above == count - 1 else 5.0
-        x = centre + slack - length  # its edge is so far beyond the centre of all planks above
+        x = centre + slack - length  # the centre of all planks above lies ``slack`` inside its edge
         rows.append((x, 0.0, 50.0 * (count - 1 - above), length, 100.0, 50.0))
         centre = (centre * above + x + length / 2) / (above + 1)
     return _plan(*rows[::-1])
 
 
 def counterweight(margin: float) -> Plan:
-    """Return a plank with its middle beyond the post and a weight on its other end."""
+    """Return a plank whose middle protrudes beyond a post, and a weight on its other end."""
     weight = (100 + margin) / (75 - margin)
     return _plan(
         (0, 0, 0, 100, 100, 100), (0, 0, 100, 400, 100, 20), (0, 25, 120, 50, 50, 50),
@@ -97,16 +104,16 @@ def counterweight(margin: float) -> Plan:
 
 
 def diagonal(margin: float) -> Plan:
-    """Return a plate on posts under opposite corners, its centre of mass off the diagonal."""
-    off = 30 - margin / math.sqrt(2)
+    """Return a plate on posts under opposite corners; its centre of mass is off the diagonal."""
+    offset = 30 - margin / math.sqrt(2)
     return _plan(
         (0, 0, 0, 60, 60, 100), (240, 240, 0, 60, 60, 100), (0, 0, 100, 300, 300, 100),
-        last_centre=(off, -off),
+        last_centre=(offset, -offset),
     )  # fmt: skip
 
 
 def bridge(margin: float) -> Plan:
-    """Return a plate over a gap, its centre of mass near the line from post to post."""
+    """Return a plate on two posts; its centre of mass is near the edge of their common support."""
     return _plan(
         (0, 0, 0, 80, 60, 150), (200, 0, 0, 100, 60, 150), (0, 0, 150, 300, 100, 40),
         last_centre=(0, 10 - margin),
@@ -114,10 +121,10 @@ def bridge(margin: float) -> Plan:
 
 
 def propped(gap: float, edge: float, margin: float) -> Plan:
-    """Return the stack of :func:`cube` with a tall neighbour where the upper cube would fall."""
-    high = cube(edge, margin).boxes - [300, 300, 0, 0, 0, 0]
-    side = high[1, 0] + edge + gap
-    return _plan(*map(tuple, high), (side, 0, 0, edge, edge, 3 * edge))
+    """Return the stack of :func:`cube` and a tall box on the side to which the upper cube tips."""
+    cubes = cube(edge, margin).boxes - [300, 300, 0, 0, 0, 0]
+    neighbour_x = cubes[1, 0] + edge + gap
+    return _plan(*map(tuple, cubes), (neighbour_x, 0, 0, edge, edge, 3 * edge))
 
 
 FAMILIES: dict[str, Callable[[float], Plan]] = {
@@ -131,21 +138,21 @@ FAMILIES: dict[str, Callable[[float], Plan]] = {
     "cube beside a tall neighbour, 0 mm": partial(propped, 0.0, 100.0),
     "cube beside a tall neighbour, 1 mm": partial(propped, 1.0, 100.0),
 }
-"""Name of each family, and its plan for a margin in millimetres."""
+"""Name of each family, and the function that returns its plan for a margin in millimetres."""
 
 
 def tower(count: int, edge: float) -> Plan:
-    """Return a tower of cubes, one on the other."""
+    """Return a tower of ``count`` cubes."""
     return _plan(*((0, 0, edge * k, edge, edge, edge) for k in range(count)))
 
 
 def wall_of_bricks() -> Plan:
-    """Return six courses of bricks, each over the joints of the one below."""
+    """Return a wall of six layers of bricks, each layer over the joints of the layer below."""
     rows = []
-    for course in range(6):
-        ends = [0, 50, 150, 250, 300] if course % 2 else [0, 100, 200, 300]
+    for layer in range(6):
+        ends = [0, 50, 150, 250, 300] if layer % 2 else [0, 100, 200, 300]
         for a, b in pairwise(ends):
-            rows.append((a, 0, 40 * course, b - a, 60, 40))
+            rows.append((a, 0, 40 * layer, b - a, 60, 40))
     return _plan(*rows)
 
 
@@ -159,14 +166,14 @@ STANDING: dict[str, Callable[[], Plan]] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """The verdicts on one control, each true if it stands."""
+    """The verdicts on one control; a verdict is true if the control stands by it."""
 
     name: str
     margin: float | None  # mm; None: stands with a large margin
     known: bool  # by statics
-    judge: bool
-    equilibrium: bool
-    everything: bool  # the judge's verdict if all boxes and the walls collide
+    judge: bool  # by the judge with the settings of the command
+    equilibrium: bool  # by the exact equilibrium
+    everything: bool  # by the judge, if all boxes and the walls collide
 
 
 def outcome(name: str, margin: float | None, plan: Plan, physics: Physics = DEFAULT) -> Outcome:
@@ -191,9 +198,9 @@ def cases() -> list[tuple[str, float | None, Plan]]:
 
 
 def flips_at(make: Callable[[float], Plan], physics: Physics = DEFAULT) -> float:
-    """Return the margin in mm at which the judge's verdict flips, to 1 µm; 0 would be exact.
+    """Return the margin in mm at which the judge's verdict flips, to 1 µm.
 
-    NaN if it does not flip within 8 mm.
+    A perfect judge flips at 0. The result is NaN if the verdict does not flip within 8 mm.
     """
 
     def stands(margin: float) -> bool:

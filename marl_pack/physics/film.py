@@ -31,13 +31,15 @@ except ModuleNotFoundError as error:
 vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it warns of missing displays
 
 FPS = 25
-EACH = 0.4  # seconds from one box to the next
+EACH = 0.4  # seconds between two placements
 REST = 2.0  # seconds after the last box, or after a fall
 STEP = Pass(1 / 1000, 50)
 ENDINGS = (".png", ".gif", ".mp4")
 PIXELS = (800, 800)
 FALLEN = "#d62728"
-COLOURS = [colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")]  # too red
+COLOURS = [
+    colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")
+]  # too similar to FALLEN
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,13 @@ class Frame:
 
     middles: Floats  # [k, 3]  metres
     rotations: Floats  # [k, 4]  quaternions, w first
-    moved: tuple[int, ...]  # boxes that moved by more than a threshold
+    moved: tuple[int, ...]  # indices of boxes that moved by more than a threshold
 
 
 def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
-    """Yield the frames of the stack being built; after a fall no more boxes come.
+    """Yield the frames of the stack being built; after a fall no more boxes are added.
 
-    A new box appears at its nominal place; the earlier boxes are where they have settled.
+    A new box appears at its nominal position; the earlier boxes stay where they have settled.
     """
     physics = replace(physics, everything=True)
     stack = stack.scaled(1.0)  # in its own size, with masses that the solver can handle
@@ -69,7 +71,7 @@ def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
 
 
 def _watch(world: World, seconds: float) -> Iterator[Frame]:
-    """Simulate a number of seconds and yield the frames."""
+    """Simulate this number of seconds and yield the frames."""
     for _ in range(round(seconds * FPS)):
         world.run(1 / FPS)
         yield Frame(*world.poses(), world.moved())
@@ -98,7 +100,7 @@ class View:
         self.plotter.camera.zoom(0.95)
 
     def _add(self, stack: Stack, i: int) -> list[Any]:
-        """Add a box and its edges around the origin, hidden, and return both."""
+        """Add a box and its edges, hidden and with the middle at the origin; return both."""
         w, d, h = (float(s) for s in stack.sides[i])
         cube = pyvista.Cube(x_length=w, y_length=d, z_length=h)
         colour = COLOURS[i % len(COLOURS)]
@@ -112,7 +114,7 @@ class View:
         return actors
 
     def picture(self, frame: Frame) -> NDArray[np.uint8]:
-        """Draw one moment, uint8 [height, width, 3], with boxes that have moved in red."""
+        """Draw one frame, uint8 [height, width, 3]; boxes that have moved are red."""
         for i, actors in enumerate(self.boxes):
             visible = i < len(frame.middles)
             for actor in actors:
@@ -134,12 +136,17 @@ class View:
 
 
 def caption_of(title: str, placed: int, boxes: int) -> str:
-    """Return the text above one moment of a film."""
+    """Return the text above one frame of a film."""
     return f"{title}: {placed} of {boxes} boxes"
 
 
 def _matrix(middle: Floats, rotation: Floats) -> Floats:
-    """Return the matrix [4, 4] of a rotation, a quaternion with w first, and a middle."""
+    """Return the matrix [4, 4] of a pose.
+
+    Args:
+        middle: x, y, z of the box's middle in metres.
+        rotation: a quaternion, w first.
+    """
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
     matrix[:3, 3] = middle
@@ -147,7 +154,7 @@ def _matrix(middle: Floats, rotation: Floats) -> Floats:
 
 
 def check_path(path: Path) -> None:
-    """Raise ValueError if no picture or film can be written there."""
+    """Raise ValueError if no picture or film can be written to this path."""
     if path.suffix.lower() not in ENDINGS:
         raise ValueError(f"{path}: needs one of the endings {', '.join(ENDINGS)}")
     check_writable(path)

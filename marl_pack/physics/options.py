@@ -14,14 +14,14 @@ def add_body_options(parser: argparse._ActionsContainer) -> None:
     """Add ``--cell``, ``--density`` and ``--com-spread`` to a command."""
     add = parser.add_argument
     add("--cell", type=float, metavar="METRES",
-        help="edge of a cell (default: the plan's own unit; without one the bin's longest side is "
-             "0.6 m)")  # fmt: skip
+        help="edge of a cell (default: the unit in the plan; if it has none, the bin's longest "
+             "side is 0.6 m)")  # fmt: skip
     add("--density", nargs=2, type=float, metavar=("LOW", "HIGH"),
-        help="draw the density of each box between these values, in kg/m³ "
+        help="draw the density of each box at random between these values, in kg/m³ "
              "(default: the weights of the packing)")  # fmt: skip
     add("--com-spread", type=float, metavar="SHARE",
-        help="draw each box's centre of mass, up to this share of each side away from the given "
-             "one (default: 0)")  # fmt: skip
+        help="draw the centre of mass of each box at random, up to this share of each side away "
+             "from the centre in the packing (default: 0)")  # fmt: skip
 
 
 def chosen_bodies(options: argparse.Namespace) -> Bodies:

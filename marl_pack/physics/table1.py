@@ -1,4 +1,4 @@
-"""The paper's Table 1: place objects at random where a rule allows it, and count how many fall.
+"""Measure the paper's Table 1: place objects at random where a rule allows it, and count falls.
 
 The bin is a cube of 0.6 m, in cells of 5 mm. The sides of objects are uniform in 0.03–0.3 m. Each
 object is placed in its first orientation, at a cell drawn uniformly from its mask. Physics judges
@@ -39,7 +39,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "hull_alpha":
         {"objects": 3000, "falls": 1, "rate": 0.0003, "total": 4452.6, "each": "1.48-1.00"},
 }  # fmt: skip
-"""The figures that the paper reports; its times are the total and "per cost", in seconds."""
+"""The figures that the paper reports; its times, in seconds, are the total and the "per cost"."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Trial:
-    """The record of one bin: its n boxes, and the verdicts and times of each placement."""
+    """The record of one bin: its n boxes, and the verdicts and times for each placement."""
 
     plan: Plan
     stands: NDArray[np.bool_]  # [n]          by the judge
@@ -68,14 +68,14 @@ class Trial:
 
 
 class Timed:
-    """A rule that measures the time of its masks."""
+    """A rule that measures how long the computation of its masks takes."""
 
     def __init__(self, rule: Rule) -> None:
         self.rule = rule
         self.seconds: list[float] = []  # CPU time of each mask
 
     def __call__(self, bins: Bins, item: OrientedItem) -> Tensor:
-        """Return the rule's mask, and record its time."""
+        """Return the rule's mask, and record how long it took."""
         start = time.process_time()
         mask = self.rule(bins, item)
         self.seconds.append(time.process_time() - start)
@@ -84,7 +84,7 @@ class Timed:
 
 @cache
 def _compile(settings: Settings) -> None:
-    """Compile the rule, so that no mask's time includes compilation."""
+    """Compile the rule, so that no measured time includes compilation."""
     list(_play(settings, -1, Timed(make_rule(settings.rule))))
 
 
@@ -106,7 +106,7 @@ def _play(settings: Settings, number: int, rule: Timed) -> Iterator[Packing]:
 
 
 def fill(settings: Settings, number: int) -> Trial:
-    """Play bin ``number`` to its end, judging after every placement."""
+    """Fill bin ``number`` until its end, and judge it after every placement."""
     import torch
 
     torch.set_num_threads(1)
@@ -119,7 +119,7 @@ def fill(settings: Settings, number: int) -> Trial:
         stack = Stack.of_plan(plan, density=DENSITY)
         stands = check(stack, settings.physics).stands
         judge_seconds = time.process_time() - start
-        # The first time in the list is for this placement: the next object's mask is made already.
+        # The list also has the time of the next object's mask; the first time is this object's.
         rows.append((stands, strict_equilibrium(plan), rule.seconds.pop(0), judge_seconds))
         if not stands:
             break
@@ -127,9 +127,9 @@ def fill(settings: Settings, number: int) -> Trial:
 
 
 def run(settings: Settings, objects: int, processes: int = 1) -> Iterator[Trial]:
-    """Fill bins until a number of objects have been placed; the last trial is cut short.
+    """Fill bins until ``objects`` objects have been placed; the last trial is cut short.
 
-    The objects do not depend on the number of processes.
+    The number of processes does not change the objects.
 
     Args:
         settings: rule, seed and physics.
