@@ -32,7 +32,7 @@ def stable_mask(
     com_offset: tuple[float, float, float] = NO_OFFSET,
     **parameters: object,
 ) -> NDArray[np.bool_]:
-    """Return where one box may be placed in one bin, from NumPy arrays without an environment.
+    """Return where one box may be placed in one bin, without an environment.
 
     Args:
         rule: a name in :data:`RULES`, or a rule from :func:`make_rule`.
@@ -40,21 +40,21 @@ def stable_mask(
         empty_map: whole numbers [W, D], empty cells below the top of each column (Algorithm 2); 0
             where the column is filled down to the floor. The heightmap does not show these cells.
         item: w, d, h along x, y, z, in cells.
-        bin_height: H in cells.
-        boxes: rows x, y, z, w, d, h of the boxes in the bin; ``lbcp`` and ``equilibrium`` need
-            them unless the bin is empty.
+        bin_height: the bin's height H in cells.
+        boxes: whole numbers [n, 6], rows x, y, z, w, d, h of the boxes in the bin; ``lbcp`` and
+            ``equilibrium`` need them unless the bin is empty.
         weights: the boxes' weights [n], for ``equilibrium``; by default their volumes. Each centre
             of mass is in the middle of the box.
         weight: the item's weight; by default its volume.
-        com_offset: offset of the item's centre of mass from its geometric centre, in fractions of
-            w, d, h.
+        com_offset: x, y, z of the item's centre of mass minus those of its geometric centre, as
+            fractions of w, d, h.
         **parameters: parameters of the rule, e.g. ``margin=1.0`` or ``thresholds="code"``.
 
     Returns:
-        Bool [W, D]: true at each low corner (x, y) where the box fits and is stable.
+        Bool [W, D]: true at (x, y) if the box fits and is stable with its low corner there.
 
     Raises:
-        ValueError: if a map, the item, a box or a parameter is impossible; the message says which.
+        ValueError: if a map, the item, a box or a parameter is impossible; the message names it.
     """
     heights, empty = _check_maps(heightmap, empty_map, bin_height)
     sides = _check_item(item)
@@ -86,7 +86,7 @@ def stable_mask(
 
 
 def _check_weight(weight: float) -> float:
-    """Return a weight as a float.
+    """Check a weight and return it as a float.
 
     Raises:
         ValueError: unless it is a finite number above 0.
@@ -98,7 +98,7 @@ def _check_weight(weight: float) -> float:
 
 
 def _check_item(item: ArrayLike) -> NDArray[np.int64]:
-    """Return the item's sides as int64 [3].
+    """Check the item's sides and return them as int64 [3].
 
     Raises:
         ValueError: unless they are three whole numbers of cells ≥ 1.
@@ -112,7 +112,7 @@ def _check_item(item: ArrayLike) -> NDArray[np.int64]:
 def _check_maps(
     heightmap: ArrayLike, empty_map: ArrayLike, bin_height: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the heightmap and the empty map as int64 [W, D].
+    """Check the heightmap and the empty map and return them as int64 [W, D].
 
     Raises:
         ValueError: if their shapes differ, or a number in them or the bin's size is impossible.
@@ -143,11 +143,12 @@ def _bind(
 
     Args:
         rule: a name or a bound rule.
-        parameters: parameters to bind; only for a name.
+        parameters: parameters to bind; allowed only if ``rule`` is a name.
         with_boxes: whether the stack is known: its boxes are given, or the bin is empty.
 
     Raises:
-        ValueError: for parameters of a bound rule, or if the rule needs boxes that were not given.
+        ValueError: if there are parameters for a bound rule, or the rule needs boxes and there are
+            none.
     """
     bound: Callable[..., torch.Tensor]
     if isinstance(rule, str):
@@ -176,7 +177,7 @@ def _stack(
     """Return the boxes, sorted so that they can be placed one by one, and their loads.
 
     Raises:
-        ValueError: if a box cannot be placed, or the boxes do not lead to the maps.
+        ValueError: if a box cannot be placed, or the placed boxes do not give the maps.
     """
     if boxes is None:
         if weights is not None:

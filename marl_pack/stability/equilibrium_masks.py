@@ -1,9 +1,9 @@
-"""Masks of exact static equilibrium: the cells where the whole stack still stands with a new box.
+"""Compute masks of exact static equilibrium: cells where the whole stack stands with a new box.
 
 Where ``hull_alpha`` is true, the stack stands: the new weight goes straight down through filled
-columns. Where ``hull_1`` is false, it does not stand: the new box itself tips. Only the other cells
-are solved, by the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium`. Near a
-tie, the same program is solved in whole numbers.
+columns. Where ``hull_1`` is false, the stack does not stand: the new box itself tips. For the other
+cells, the reduced linear program of :mod:`marl_pack.stability.reduced_equilibrium` is solved. If
+rounding errors could change its result (a tie), the same program is solved in whole numbers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from marl_pack.stability.static_equilibrium import in_equilibrium
 CORNERS = ((1020, 0), (942, 391), (721, 721), (391, 942))
 """Corners of a polygon around the disc whose radius is the margin, in thousandths of the margin.
 The other corners are these corners rotated by 90°, 180° and 270°. The polygon reaches at most 2 %
-beyond the disc, which is the safe side."""
+beyond the disc, so it is never less strict than the disc."""
 
 
 @njit(cache=True, nogil=True)
@@ -97,13 +97,13 @@ def equilibrium_mask(
 
     Args:
         bins: N bins, with their boxes in order of placement.
-        item: the new boxes, items in A orientations.
+        item: the new boxes, in A orientations.
         surely: bool [N, A, W, D], the mask of ``hull_alpha``: cells known to be stable.
         possibly: bool [N, A, W, D], the mask of ``hull_1``: cells that may be stable.
-        margin: the stack must stand with the new box's centre of mass anywhere within so many cells
-            of its position.
-        check_stack: whether to check first that the stack is in equilibrium. Where it is not,
-            the whole stack is solved for every cell of ``possibly``.
+        margin: distance in cells; the stack must stand wherever the new box's centre of mass lies
+            within this distance of its position.
+        check_stack: whether to check first that the stack is in equilibrium. If it is not, the
+            whole stack is solved for every cell of ``possibly``.
 
     Returns:
         ``surely``, and the cells of ``possibly`` where the whole stack stands.

@@ -1,8 +1,8 @@
-"""Convex-hull masks in compiled loops: no window is read twice (Numba).
+"""Compute convex-hull masks in compiled loops (Numba), without reading any window twice.
 
 Each column has a number K: 2 · height + 1 if its top counts as support, else 2 · height. The
-largest K of a window says its resting height, and whether a supporting cell lies at this height, in
-one small integer. If it is odd, the contact cells that count are those with this K. One sliding
+largest K of a window gives its resting height and says whether a supporting cell lies at this
+height. If this K is odd, the contact cells that count are the cells with this K. One sliding
 maximum of K over quarter windows, by doubling on the flattened map, gives both for each quadrant of
 every window around the centre of mass:
 

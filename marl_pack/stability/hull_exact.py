@@ -1,4 +1,4 @@
-"""Exact tests whether a point lies inside the convex hull of cells, in compiled loops.
+"""Test exactly whether a point lies inside the convex hull of cells, in compiled loops.
 
 A cell is a unit square, so the hull of a set of cells depends only on the first and the last cell
 of each row. All tests are strict: a point on the hull's edge is not inside.
@@ -14,8 +14,8 @@ from marl_pack.installation import njit
 
 YES, UNDECIDED = 2, 1
 """Codes of a window: its centre of mass is inside the hull (YES), or the exact test must decide
-(UNDECIDED). A code is the number of tests that the window passes: a YES also passes the weaker test
-of an UNDECIDED window."""
+(UNDECIDED). A code is the number of tests that the window passes: a window with YES also passes the
+weaker test that an UNDECIDED window passes."""
 
 OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 """Verdicts of the exact test. UNSURE: float64 cannot tell, so exact fractions must decide."""

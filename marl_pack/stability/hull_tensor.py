@@ -1,9 +1,8 @@
 """Convex-hull masks in batched tensor code, for any device.
 
-The rule and its quadrants are those of :mod:`marl_pack.stability.hull_compiled`: sliding maxima by
-doubling, and an exact test of the few windows that the quadrants leave undecided. The maxima are
-computed with gathers here, because each oriented item has another window. The results are equal
-cell by cell.
+The method is that of :mod:`marl_pack.stability.hull_compiled`: sliding maxima by doubling, and an
+exact test of the few windows that the quadrants leave undecided. Here gathers compute the maxima,
+because the windows of oriented items have different sizes. The masks are equal cell by cell.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ def _below_chain(
 
     Args:
         points: float64 [U, P], height of the hull's boundary points over x = 0 … P - 1, in cells.
-        present: bool [U, P], which of them exist.
+        present: bool [U, P], which of these points exist.
         com: float64 [U, 2], in units of ``centres``.
         centres: the table with the margin and the unit.
 
     Returns:
-        Whether ``com`` surely lies there and whether it possibly lies there, bool [U] each. Both
-        are equal where float64 is exact.
+        Two answers, bool [U] each: whether ``com`` surely lies below, and whether it may.
+        They are equal where float64 is exact.
     """
     size = points.shape[1]
     unit, margin = centres.unit, centres.margin
@@ -106,11 +105,11 @@ def inside(contact: Tensor, com: Tensor, centres: CentreTable) -> tuple[Tensor, 
 
     Args:
         contact: bool [U, w, d], the contact cells that count.
-        com: float64 [U, 2], from the window's low corner, in units of ``centres``.
+        com: float64 [U, 2], measured from the window's low corner, in units of ``centres``.
         centres: the table with the margin and the unit.
 
     Returns:
-        Whether ``com`` surely lies there and whether it possibly lies there, bool [U] each.
+        Two answers, bool [U] each: whether ``com`` surely lies inside, and whether it may.
     """
     count, w, _ = contact.shape
     present, upper, lower = boundary(contact)
@@ -136,10 +135,10 @@ def inside(contact: Tensor, com: Tensor, centres: CentreTable) -> tuple[Tensor, 
 def _largest_levels(
     level: Tensor, sides: Tensor, low: Tensor, start: Tensor, equal: bool, cover: bool
 ) -> tuple[Tensor, list[Tensor], list[Tensor]]:
-    """Compute the largest K of each window, of its quadrants and of its halves.
+    """Compute the largest K of each window, and of its quadrants and halves.
 
     Args:
-        level: int16 [B, W, D], K of every column.
+        level: int16 [B, W, D], K of every column (:mod:`marl_pack.stability.hull_compiled`).
         sides: int64 [B, 2], the windows' sides w, d.
         low: int64 [B, 2], cells of the parts that begin at the window's low corner.
         start: int64 [B, 2], first cells of the parts that end at the window's high corner.
@@ -190,7 +189,7 @@ def support_mask(
         heightmap: int16 [N, W, D].
         empty_map: int or bool [N, W, D]; only columns where it is 0 count as support.
         sides: int16 [N, A, 3].
-        height: H, at most 16383 cells.
+        height: the bin's height H, at most 16383 cells.
         centres: table of the centres of mass with the margin; None: centres of mass in the middle
             and no margin.
 

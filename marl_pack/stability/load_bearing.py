@@ -1,4 +1,4 @@
-"""Load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123) on a raster.
+"""Compute load-bearable convex polygons (Gao et al. 2025, arXiv 2507.09123) in whole cells.
 
 A box whose centre of mass lies in a polygon of load-bearing contact can itself carry any load
 inside that polygon. So cells of its top above a gap may support the next box. A cell counts only if
@@ -22,7 +22,7 @@ from marl_pack.stability.hull_tensor import PAIR_CELLS, boundary
 
 
 def lbcp_bearing(bins: Bins) -> Tensor:
-    """Return the columns whose top can carry any load, bool [N, W, D], from the placed boxes.
+    """Return which columns have a top that can carry any load, bool [N, W, D].
 
     The floor can carry any load everywhere. A box can carry it on those cells of its top whose
     whole square lies in the hull of the load-bearing squares on which the box rests.
@@ -35,7 +35,10 @@ def lbcp_bearing(bins: Bins) -> Tensor:
 
 @njit(cache=True)
 def _chain_at(chain: Any, size: int, x: int, sign: int) -> int:
-    """Return a chain's y at ``x``, rounded to the inside: down for the upper chain (sign 1)."""
+    """Return a chain's y at ``x``, rounded towards the inside of the hull.
+
+    The sign is 1 for the upper chain (rounded down) and -1 for the lower chain (rounded up).
+    """
     for i in range(size - 1):
         ax, ay, bx, by = chain[i, 0], chain[i, 1], chain[i + 1, 0], chain[i + 1, 1]
         if ax <= x <= bx:
@@ -63,7 +66,7 @@ def _fill_hull(cells: Any, lo: Any, hi: Any, upper: Any, lower: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _replay(boxes: Any, count: Any, out: Any) -> None:
-    """Write the bearing columns [N, W, D] by placing the boxes [N, M, 6] one after the other."""
+    """Place the boxes [N, M, 6] one after another and write the bearing columns [N, W, D]."""
     n, width, depth = out.shape
     heightmap = np.empty((width, depth), np.int64)
     lo, hi = np.empty(width, np.int64), np.empty(width, np.int64)
@@ -92,7 +95,7 @@ def _bearing_compiled(bins: Bins) -> Tensor:
 
 
 def _bearing_tensor(bins: Bins) -> Tensor:
-    """Compute :func:`lbcp_bearing` in tensor code, box by box and all bins at once."""
+    """Compute :func:`lbcp_bearing` in tensor code, box by box and for all bins at once."""
     n, (width, depth, _) = len(bins), bins.size
     heightmap = torch.zeros_like(bins.heightmap)
     bearing = torch.ones_like(heightmap, dtype=torch.bool)

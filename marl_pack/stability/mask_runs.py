@@ -1,4 +1,4 @@
-"""The order in which compiled loops compute masks: runs of equal footprints."""
+"""Order masks for compiled loops so that masks with equal footprints form runs."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def _footprint_keys(sides: Any, equal: Any, shape: tuple[int, int], height: int)
     """Number the footprints of oriented items [N · A, 3] that need a mask of their own.
 
     Returns:
-        int64 [N · A], the key of each footprint; -1 where the item does not fit into the bin or has
-        an earlier equal item. And the number of possible keys.
+        int64 [N · A], the key of each footprint (-1 where the item does not fit into the bin or has
+        an earlier equal item), and the number of possible keys.
     """
     masks = sides.shape[0]
     key = np.empty(masks, np.int64)
@@ -63,9 +63,9 @@ def runs_of_footprints(
     """Order the masks so that equal footprints follow each other, and cut the order into runs.
 
     Returns:
-        The order: indices into N · A, without the items that do not fit into the bin or have an
-        earlier equal item. And the limits of the runs in it: a run has at most ``size`` masks, all
-        with the same footprint.
+        The order (indices into N · A, without the items that do not fit into the bin or have an
+        earlier equal item), and the limits of the runs in this order. A run has at most ``size``
+        masks, all with the same footprint.
     """
     masks = sides.shape[0]
     key, keys = _footprint_keys(sides, equal, shape, height)

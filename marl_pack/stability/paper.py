@@ -1,4 +1,4 @@
-"""Algorithms 1 and 2 of Zhou et al. 2024, step by step as they are printed, with OpenCV.
+"""Algorithms 1 and 2 of Zhou et al. 2024 with OpenCV, step by step as in the paper.
 
 Readers can compare this module with the paper line by line. The package itself uses
 :mod:`marl_pack.stability.reference` and its fast versions. They differ from the paper where it
@@ -10,7 +10,7 @@ would let boxes fall or forbid stable placements:
 - *Strictly inside.* ``center.within(hull)`` does not say whether the hull's edge counts. A box that
   is balanced on an edge does not stand, so in the package the edge never counts.
 - *One rule everywhere.* Algorithm 1 accepts every box on the floor. The package tests the floor
-  like any other contact, so a margin or a centre of mass off the middle counts on the floor too.
+  like any other contact, so a margin or an offset of the centre of mass counts on the floor too.
 - *Any centre of mass.* Algorithm 1 tests the window's centre. The package tests any known centre of
   mass.
 
@@ -52,7 +52,7 @@ def convex_hull_alpha(
         empty_map: E, the empty cells below the top of each column, whole numbers [W, D].
         item: sides w, d, h of the object.
         bin_height: height H of the bin.
-        reading: what the points of the hull are.
+        reading: how a cell becomes points of the hull.
 
     Returns:
         Bool [W, D]: whether the object is stable with its low corner at (x, y).
@@ -112,7 +112,7 @@ def _centre_within_hull(cells: NDArray[np.bool_], reading: Reading) -> bool:
 
     Args:
         cells: the points of support, bool [w, d].
-        reading: what the points of the hull are.
+        reading: how a cell becomes points of the hull.
     """
     try:
         import cv2

@@ -1,4 +1,4 @@
-r"""The reduced linear program of one box placed on a stack in equilibrium, in compiled loops.
+r"""Solve the linear program of one new box on a stack in equilibrium, reduced to a few boxes.
 
 :mod:`marl_pack.stability.static_equilibrium` solves the linear program of a whole stack. A mask
 needs thousands of such solutions, for stacks that are known to stand, so the program is reduced:
@@ -18,8 +18,9 @@ needs thousands of such solutions, for stacks that are known to stand, so the pr
   boxes keep their balance: the cone is a product.
 
 A small dense simplex method solves the program of the few boxes that remain. The forces that it
-finds are put back into the equations. If they do not confirm the result, or the result is nearly a
-tie, it is UNSURE, and the same program is solved in whole numbers (:func:`stands_by_fractions`).
+finds are put back into the equations. If they do not confirm the result, or the result is so close
+to a tie that rounding errors could change it, the result is UNSURE. Then the same program is solved
+in whole numbers (:func:`stands_by_fractions`).
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def _touches(a: Any, b: Any) -> bool:
 
 @njit(cache=True, inline="always")
 def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
-    """Find where the ground pushes a box: at the vertices of the hull of its bearing cells.
+    """Find the points where the ground pushes a box: the vertices of the hull of its bearing cells.
 
     Args:
         bearing: bool [w, d], contact cells over columns that are filled to the floor.
@@ -87,7 +88,7 @@ def ground_points(bearing: Any, scratch: Any, points: Any) -> int:
 
 @njit(cache=True, inline="always")
 def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing: Any) -> bool:
-    """Mark the cells of a window that touch a box resting at ``z`` and bear.
+    """Mark the bearing cells of a window: they touch a box at ``z``, and their columns are filled.
 
     Args:
         heightmap: integers [W, D].
@@ -98,7 +99,7 @@ def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing
         bearing: bool [w, d], written.
 
     Returns:
-        Whether all cells of the window touch and bear.
+        Whether all cells of the window are bearing cells.
     """
     full = True
     for i in range(bearing.shape[0]):
@@ -110,7 +111,7 @@ def mark_bearing(heightmap: Any, empty_map: Any, x: int, y: int, z: int, bearing
 
 @njit(cache=True)
 def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[Any, Any, Any]:
-    """Replay a stack to find its grounded boxes, and where the ground pushes the other boxes.
+    """Find the grounded boxes of a stack, and the points where the ground pushes the other boxes.
 
     Args:
         boxes: int64 [≥ n, 6], rows x, y, z, w, d, h in order of placement.
@@ -119,8 +120,9 @@ def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[An
         scratch: int64 [3, 2W + 2, 2].
 
     Returns:
-        Grounded boxes bool [n + 1], ground points float64 [n + 1, 4W + 4, 2] and their number
-        int64 [n + 1]; the last row of each is free for a new box.
+        Whether each box is grounded, bool [n + 1]; the points where the ground pushes it,
+        float64 [n + 1, 4W + 4, 2]; and their number, int64 [n + 1]. The last row of each array is
+        free for a new box.
     """
     heightmap = np.zeros(shape, np.int64)
     empty_map = np.zeros(shape, np.int64)
@@ -147,8 +149,9 @@ def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tu
     """Find the boxes that the new box ``n`` may disturb.
 
     Returns:
-        These boxes int64 [S] in the order of their rows in the system, the row of each box
-        int64 [n + 1] (-1: not in it), and the number of forces that act on them.
+        The indices of these boxes in the order of the system of equations, int64 [S]; the place of
+        each box in this order, int64 [n + 1] (-1: not in it); and the number of forces that act on
+        them.
     """
     row = np.full(n + 1, -1, np.int64)
     queue = np.empty(n + 1, np.int64)
@@ -222,7 +225,7 @@ def _system(
 def stands(
     boxes: Any, loads: Any, n: int, grounded: Any, points: Any, count: Any, whole: bool
 ) -> int:
-    """Decide whether box ``n``, placed on the boxes before it, leaves them in strict equilibrium.
+    """Decide whether box ``n`` and the boxes placed before it are in strict equilibrium.
 
     Args:
         boxes: int64 [n + 1, 6], rows x, y, z, w, d, h.
@@ -234,7 +237,7 @@ def stands(
         whole: whether to solve all ungrounded boxes, or only those that the new box may disturb.
 
     Returns:
-        YES or NO; UNSURE if the simplex method cannot be trusted or the result is nearly a tie.
+        YES or NO; UNSURE if rounding errors could change the result.
     """
     members, row, forces = _component(boxes, n, grounded, count, whole)
     a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
@@ -254,7 +257,9 @@ def stands_by_fractions(
     shape: tuple[int, int],
     whole: bool,
 ) -> bool:
-    """Decide in exact arithmetic what :func:`stands` decides.
+    """Decide in exact arithmetic whether a new box leaves the stack in strict equilibrium.
+
+    :func:`stands` decides the same in float64.
 
     Args:
         boxes: int64 [n + 1, 6], rows x, y, z, w, d, h in order of placement; the last box is new.

@@ -1,10 +1,10 @@
-"""The definition of every rule, one window at a time, in plain NumPy.
+"""Define every stability rule in plain NumPy, for one window at a time.
 
-These functions are slow. They define what a rule means, and the batched code is tested against them
-cell by cell. The arithmetic is exact: a float means the decimal that is printed for it, so 0.1 is
-one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the corners
-of the contact squares, and a centre of mass must lie strictly inside it. ``docs/reproduce.md``
-lists where this differs from the paper.
+These functions are slow. They define what a rule means, and tests compare the batched code with
+them cell by cell. The arithmetic is exact: a float means the decimal that is printed for it, so 0.1
+is one tenth. A cell is a unit square, not a point: a support polygon is the convex hull of the
+corners of the contact squares, and a centre of mass must lie strictly inside it.
+``docs/reproduce.md`` lists where this differs from the paper.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
 
     Args:
         cells: bool [w, d], the supporting cells.
-        com: the centre of mass from the low corner of ``cells``; floats are taken as decimals.
+        com: the centre of mass, measured from the low corner of ``cells``; a float is taken as a
+            decimal.
         margin: number of cells, ≥ 0; a float is taken as a decimal.
     """
     if not cells.any():
@@ -94,7 +95,7 @@ def supported(cells: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
 
 
 def hull(heights: Map, bearing: NDArray[np.bool_], com: Point, margin: Number = 0) -> bool:
-    """Return the verdict of ``hull_1``, ``hull_alpha`` and ``lbcp`` on one window.
+    """Return whether one window is stable by ``hull_1``, ``hull_alpha`` or ``lbcp``.
 
     Only contact cells in ``bearing`` count. ``bearing`` is true everywhere for hull_1 (the paper's
     p_f), ``empty_map == 0`` for hull_alpha (p_f', Algorithm 1) and :func:`lbcp_bearing` for lbcp.

@@ -1,7 +1,7 @@
-"""The stability rules and the table that names them.
+"""Define the stability rules and the table of their names.
 
-The code that computes masks is imported with the first mask, so that the names and parameters of
-the rules are available without it.
+The code that computes masks is imported when the first mask is computed, so that the names and
+parameters of the rules can be used without it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Rule = Callable[["Bins", "OrientedItem"], "Tensor"]
 """``(bins, item) -> bool [N, A, W, D]``: the cells (low corners) where the item fits into the bin
-in each orientation and is stable by the rule. Parameters are bound beforehand
+in each orientation and is stable by the rule. The rule's parameters are bound already
 (:func:`functools.partial`)."""
 
 
@@ -66,9 +66,9 @@ def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float)
 
 
 def hull_1(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
-    """Return the mask of convexHull-1: all contact squares count.
+    """Return the mask of convexHull-1.
 
-    The centre of mass must lie strictly inside their convex hull.
+    The centre of mass must lie strictly inside the convex hull of all contact squares.
 
     Args:
         bins: N bins.
@@ -102,13 +102,14 @@ def lbcp(bins: Bins, item: OrientedItem, margin: float = 0.0) -> Tensor:
 
 
 def area_ratio(bins: Bins, item: OrientedItem, thresholds: Thresholds | str = "paper") -> Tensor:
-    """Return the mask of Zhao et al. 2021: supported share of the bottom face, and corners.
+    """Return the mask of Zhao et al. 2021, by the supported area and corners of the bottom face.
 
     Args:
         bins: N bins.
         item: the bins' items; their centres of mass are ignored.
         thresholds: ``"paper"`` (60 % and 4 corners, 80 % and 3, 95 %), ``"code"`` (50 / 85 / 95, as
-            in the authors' code), or pairs (share, corners). More than the share must be supported.
+            in the authors' code), or pairs (share, corners). The supported area must be larger
+            than the share.
     """
     pairs = check_thresholds(thresholds)
     mask: Tensor = _area_mask(bins.backend)(bins.heightmap, item.sides, bins.height, pairs)
@@ -126,8 +127,8 @@ def equilibrium(
     Args:
         bins: N bins whose stacks stand; with ``check_stack`` any bins.
         item: the bins' items in A orientations.
-        margin: the stack must stand with the item's centre of mass anywhere within so many cells of
-            its position.
+        margin: distance in cells; the stack must stand wherever the item's centre of mass lies
+            within this distance of its position.
         check_stack: whether to check that the stacks stand instead of assuming it.
     """
     from marl_pack.stability.equilibrium_masks import equilibrium_mask
@@ -137,9 +138,9 @@ def equilibrium(
 
 
 def none(bins: Bins, item: OrientedItem) -> Tensor:
-    """Return where the item fits into the bin, placed from above, without a stability rule.
+    """Return the mask without a stability rule: where the item fits, placed from above.
 
-    This is a baseline for comparisons, and for tests of the physics simulation.
+    It is a baseline for comparisons and for tests of the physics simulation.
     """
     return area_ratio(bins, item, ((0.0, 0),))
 
@@ -156,7 +157,7 @@ RULES: dict[str, Callable[..., Tensor]] = {
 
 
 def unknown_rule(name: object) -> ValueError:
-    """Return the error for an unknown rule; it suggests the nearest name."""
+    """Return the error for an unknown rule; it suggests the most similar name."""
     guess = renamed.guess(name, RULES) if isinstance(name, str) else ""
     names = ", ".join(RULES)
     return ValueError(f"unknown stability rule {shown(name)}: needs one of {names}{guess}")

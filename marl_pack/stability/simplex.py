@@ -1,7 +1,7 @@
-"""A small dense simplex method for the linear programs of static equilibrium.
+"""Solve the linear programs of static equilibrium by a small dense simplex method.
 
-These programs have a dozen rows and a few dozen columns, and are degenerate. Thousands of them are
-solved, and the call of a library would take a hundred times as long as the pivots.
+These programs have a dozen rows and a few dozen columns, and are degenerate. A mask needs thousands
+of them, and the call of a library would take a hundred times as long as the pivots.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import numpy as np
 from marl_pack.installation import njit
 
 NEAR = 1e-6
-"""Least force, or least error of the equations, in mean weights, above which float64 decides."""
+"""Float64 decides if the least force (or, without a solution, the least error of the equations) is
+above this number, in mean weights."""
 RESIDUAL = 1e-9
-"""Largest sum of the equations' errors that counts as rounding."""
+"""A larger sum of the equations' errors cannot come from rounding."""
 
 SMALLEST_PIVOT = 1e-6
-"""A division by a smaller number may magnify rounding errors, so float64 is not trusted then."""
+"""A division by a smaller number may magnify rounding errors; then float64 is not trusted."""
 
 
 @njit(cache=True, inline="always")
@@ -30,7 +31,7 @@ def nearly_a_tie(force: float, reach: float) -> bool:
 
     Args:
         force: the least force, from :func:`max_least_force`.
-        reach: cells from one end of the boxes to the other.
+        reach: largest distance between two ends of the boxes along an axis, in cells.
     """
     return abs(force) <= max(NEAR, 2 * RESIDUAL * reach)
 
@@ -51,12 +52,13 @@ def _pivot(table: Any, basis: Any, row: int, column: int) -> None:
 def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
     """Minimise the last row's objective by the simplex method, until it is below ``-enough``.
 
-    The column with the largest coefficient enters the basis. Among tied rows (the moments'
-    right-hand sides are all 0) the row with the largest pivot leaves it, which keeps the numbers
-    accurate. After many iterations, which may be a cycle, Bland's rule is used.
+    The column with the most negative coefficient enters the basis. Among rows with equal ratios
+    (the right-hand sides of moments are all 0), the row with the largest pivot leaves the basis,
+    which keeps the numbers accurate. After many iterations, which may be a cycle, Bland's rule is
+    used.
 
     Returns:
-        Whether the method ended regularly, within the limit on iterations.
+        Whether the method ended by its rules, before the limit on iterations.
     """
     rows = basis.size
     for iteration in range(200 * rows + 1000):
@@ -85,14 +87,14 @@ def _optimise(table: Any, basis: Any, columns: int, enough: float) -> bool:
                 if ratio < best - 1e-13 or better:
                     row, best = i, ratio
         if row < 0 or table[row, column] < SMALLEST_PIVOT:
-            return False  # only by rounding: forces are bounded by the weights, so a row exists
+            return False  # rounding errors: the weights bound the forces, so a row exists
         _pivot(table, basis, row, column)
     return False
 
 
 @njit(cache=True)
 def _solution(table: Any, basis: Any, a: Any, weight: Any) -> tuple[float, float, float]:
-    """Read the solution from a tableau, and check it in the equations.
+    """Read the solution from a simplex table, and check it in the equations.
 
     Returns:
         t, the sum of the equations' absolute errors, and the least force.
@@ -126,7 +128,7 @@ def max_least_force(a: Any, weight: Any, enough: float) -> tuple[float, bool, An
     Returns:
         The optimum, or the first value above ``enough``; if no ``f ≥ 0`` solves the equations,
         minus the smallest possible sum of their errors. Whether the forces, put back into the
-        equations, confirm this value: false if rounding errors have corrupted the tableau. The
+        equations, confirm this value: false if rounding errors have corrupted the table. The
         basis int64 [R]: columns of a, m for t, or m + 1 + r for the error of equation r.
     """
     rows, columns = a.shape

@@ -1,14 +1,16 @@
 r"""Exact static equilibrium of a whole stack (Wang & Hauser, T-RO 2021).
 
-A stack of boxes stands if vertical forces :math:`f \ge 0` at the corners of every contact
-rectangle (box on box, box on floor) balance force and moment of every box, :math:`A f = w`. It
+A stack of boxes stands if vertical forces :math:`f \ge 0` at the corners of every contact rectangle
+(box on box, box on floor) balance force and moment of every box, :math:`A f = w`. Each row of
+:math:`A` balances the vertical force or one moment of a box; :math:`w` holds the weights. The stack
 stands *strictly* if it also stands after any small shift of the weights, that is if :math:`w` is in
 the interior of the cone :math:`\{A f : f \ge 0\}`. Every box rests on contact of nonzero area, so
 :math:`A` has full row rank and the interior is :math:`\{A f : f > 0\}`. So the stack stands
 strictly iff the linear program :math:`\max t,\ A f = w,\ f \ge t` has a positive optimum.
 
-:func:`in_equilibrium` decides this for a whole stack, with SciPy's HiGHS or, near a tie, in exact
-arithmetic. It is the reference for :mod:`marl_pack.stability.equilibrium_masks`.
+:func:`in_equilibrium` decides this for a whole stack: with SciPy's HiGHS or, if the optimum is
+close to 0 (a tie), in exact arithmetic. It is the reference for
+:mod:`marl_pack.stability.equilibrium_masks`.
 """
 
 from __future__ import annotations
@@ -26,10 +28,11 @@ from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 
 NEAR = 1e-5
-"""Least force, in mean weights of the stack, above which HiGHS is trusted; its forces balance up to
-1e-7. Below, exact arithmetic decides (:mod:`marl_pack.stability.exact_equilibrium`)."""
+"""HiGHS is trusted if its least force, in mean weights of the stack, is above this number; its
+forces balance up to 1e-7. Otherwise exact arithmetic decides
+(:mod:`marl_pack.stability.exact_equilibrium`)."""
 MAX_LENGTH = 1 << 31
-"""Coordinates of boxes lie below this number."""
+"""All coordinates of boxes are less than this number."""
 
 
 def contacts(boxes: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -39,8 +42,8 @@ def contacts(boxes: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.
         boxes: int [n, 6], rows x, y, z, w, d, h.
 
     Returns:
-        Pairs int64 [C, 2] of upper and lower box (-1: the floor), and rectangles int64 [C, 4] as
-        x0, y0, x1, y1.
+        The indices of the upper and the lower box of each contact, int64 [C, 2] (-1: the floor),
+        and the rectangles x0, y0, x1, y1, int64 [C, 4].
     """
     pairs, rectangles = [], []
     rows = boxes.astype(np.int64)
@@ -69,22 +72,22 @@ def uniform_loads(boxes: NDArray[np.integer]) -> NDArray[np.float64]:
 
 
 def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = None) -> float:
-    """Compute the optimum of ``max t, A f = w, f ≥ t`` in mean weights of the stack.
+    """Compute the optimum of ``max t, A f = w, f ≥ t``, as a multiple of the stack's mean weight.
 
     Args:
         boxes: int [n, 6], rows x, y, z, w, d, h.
         loads: float [n, 3], weight and x, y of each centre of mass; uniform density by default.
 
     Returns:
-        The optimum minus the largest possible effect of the solver's errors; infinity for no boxes,
-        -inf if no ``f ≥ 0`` balances the stack.
+        The optimum minus the largest possible effect of the solver's errors; infinity if there are
+        no boxes, -inf if no ``f ≥ 0`` balances the stack.
     """
     n = len(boxes)
     if n == 0:
         return np.inf
     loads = uniform_loads(boxes) if loads is None else loads
     pairs, rectangles = contacts(boxes)
-    points = rectangles[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 2)  # four corners each
+    points = rectangles[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 2)  # four corners per contact
     upper, lower = np.repeat(pairs, 4, axis=0).T
     force = np.arange(len(points))
     box, sign = np.concatenate((upper, lower)), np.repeat((1.0, -1.0), len(points))
@@ -118,8 +121,8 @@ def least_force(boxes: NDArray[np.integer], loads: NDArray[np.float64] | None = 
 def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
     """Return whether a whole stack is in strict static equilibrium.
 
-    The result is exact: decimals in ``loads`` are taken exactly. It takes about 2 ms for 20 boxes,
-    and longer if the stack is nearly a tie.
+    The result is exact: decimals in ``loads`` are taken exactly. The function takes about 2 ms for
+    20 boxes, and longer near a tie, where a small shift of the weights changes the result.
 
     Args:
         boxes: whole numbers [n, 6], rows x, y, z, w, d, h in cells. A box falls if it rests neither
@@ -127,8 +130,8 @@ def in_equilibrium(boxes: ArrayLike, loads: ArrayLike | None = None) -> bool:
         loads: float [n, 3], weight and x, y of each centre of mass; uniform density by default.
 
     Raises:
-        ValueError: for a box without volume, two boxes that overlap, or a load that is not finite
-            or has no positive weight; the message says which.
+        ValueError: if a box has no volume, two boxes overlap, or a load is not finite or has no
+            positive weight; the message names it.
     """
     stack = check_boxes(boxes)
     if not len(stack):
@@ -159,7 +162,7 @@ def stands(boxes: NDArray[np.int64], loads: Sequence[Load]) -> bool:
 
 
 def _components(n: int, pairs: NDArray[np.int64]) -> list[list[int]]:
-    """Return lists of the indices of boxes that contacts join, the shortest list first."""
+    """Group boxes that contacts connect; return the indices of each group, the smallest first."""
     touching = pairs[pairs[:, 1] != GROUND]
     graph = csr_array((np.ones(len(touching)), touching.T), shape=(n, n))
     _, labels = connected_components(graph, directed=False)
@@ -168,7 +171,7 @@ def _components(n: int, pairs: NDArray[np.int64]) -> list[list[int]]:
 
 
 def check_boxes(boxes: ArrayLike) -> NDArray[np.int64]:
-    """Return boxes as int64 [n, 6].
+    """Check boxes and return them as int64 [n, 6].
 
     Raises:
         ValueError: unless they are rows of whole numbers with a volume, and no two overlap.
@@ -188,7 +191,7 @@ def check_boxes(boxes: ArrayLike) -> NDArray[np.int64]:
 
 
 def _check_loads(loads: ArrayLike, n: int) -> NDArray[np.float64]:
-    """Return loads as float64 [n, 3].
+    """Check loads and return them as float64 [n, 3].
 
     Raises:
         ValueError: unless there is a finite row for each of n boxes, with a positive weight.
@@ -206,7 +209,7 @@ def _check_loads(loads: ArrayLike, n: int) -> NDArray[np.float64]:
 
 
 def whole_cells(name: str, values: ArrayLike) -> NDArray[np.int64]:
-    """Return ``values`` as whole numbers of cells, int64.
+    """Check ``values`` and return them as whole numbers of cells, int64.
 
     Args:
         name: name of the values, for messages.

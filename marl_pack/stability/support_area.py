@@ -1,4 +1,4 @@
-"""The rule of the supported area (Zhao et al. 2021) of a box's bottom face, and its corners.
+"""Compute masks by the supported area and corners of a box's bottom face (Zhao et al. 2021).
 
 The rule is not sound: it ignores the centre of mass, and whether the boxes below are supported.
 """
@@ -68,7 +68,7 @@ def _fill_masks(
 
 
 def _fewest_cells(sides: Tensor, thresholds: Thresholds) -> Tensor:
-    """Compute how many supported cells exceed the share of each threshold, int64 [N, A, T].
+    """Compute the least number of supported cells above each threshold's share, int64 [N, A, T].
 
     The arithmetic is exact: 60 % of 5 cells are 3 cells, so 4 cells exceed this share.
     """
@@ -92,7 +92,7 @@ def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thr
     Args:
         heightmap: int16 [N, W, D].
         sides: int16 [N, A, 3], the boxes' sides along x, y, z.
-        height: H.
+        height: the bin's height H.
         thresholds: pairs (share, corners).
 
     Returns:
