@@ -7,11 +7,11 @@ from marl_pack.checks import real_number, shown, whole_number
 Thresholds = tuple[tuple[float, int], ...]
 
 PAPER: Thresholds = ((0.60, 4), (0.80, 3), (0.95, 0))
-"""The thresholds in the text of Zhang et al. (2025), as pairs (share, corners). A box is stable if,
+"""The thresholds in the paper of Zhao et al. 2021, as pairs (share, corners). A box is stable if,
 for one of the pairs, more than this share of its bottom face and at least this number of its
 corners are supported."""
 CODE: Thresholds = ((0.50, 4), (0.85, 3), (0.95, 0))
-"""The thresholds in the code that the authors released."""
+"""The thresholds in the code that Zhao et al. released."""
 THRESHOLDS = {"paper": PAPER, "code": CODE}
 """The thresholds by name."""
 
