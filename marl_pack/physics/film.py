@@ -37,9 +37,8 @@ STEP = Pass(1 / 1000, 50)
 ENDINGS = (".png", ".gif", ".mp4")
 PIXELS = (800, 800)
 FALLEN = "#d62728"
-COLOURS = [
-    colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")
-]  # too similar to FALLEN
+# Without the two colours that are too similar to FALLEN.
+COLOURS = [colour for colour in PALETTE if colour not in ("#e15759", "#ff9da7")]
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Frame:
 def simulate(stack: Stack, physics: Physics = DEFAULT) -> Iterator[Frame]:
     """Yield the frames of the stack being built; after a fall no more boxes are added.
 
-    A new box appears at its nominal position; the earlier boxes stay where they have settled.
+    A new box appears at its nominal position; the earlier boxes begin where they have settled.
     """
     physics = replace(physics, everything=True)
     stack = stack.scaled(1.0)  # in its own size, with masses that the solver can handle
