@@ -142,7 +142,9 @@ def check_teacher(name: str, agent: Agent, config: Config) -> None:
     if iterations not in MANY:
         refuse(duration, iterations, f"needs {MANY}")
     if agent.frozen:
-        raise ConfigError(f"{key}: a frozen agent does not learn")
+        raise ConfigError(
+            f"{key}: a frozen agent does not learn; give {name}.teacher null and {duration} 0"
+        )
     if config.joint:
         raise ConfigError(f"{key}: the joint agent clones no teacher")
     if config.ppo.normalize_advantage_per_mini_batch:
