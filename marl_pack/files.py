@@ -80,10 +80,10 @@ def same_plain_file(a: Path, b: Path) -> bool:
 
 @contextmanager
 def moved_into_place(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary file with the same ending; move it into place at the end.
+    """Yield the path of a temporary file with the same suffix; move the file into place at the end.
 
-    An existing file keeps its mode and owner. If ``path`` is not a plain file, the content is
-    copied into it instead.
+    An existing file keeps its mode and, if permitted, its owner. If ``path`` is not a plain file,
+    the content is copied into it instead.
 
     Raises:
         OSError: if the file cannot be written; the message names ``path``. An existing file does
@@ -146,8 +146,8 @@ def write_atomically(path: Path, write: Callable[[Any], None]) -> None:
 
     Args:
         path: the file to write.
-        write: a function that writes the content to a binary file in memory, so that its errors
-            are not errors of the disk.
+        write: a function that writes the content to a binary file in memory. So an OSError comes
+            from the disk, not from this function.
     """
     content = io.BytesIO()
     write(content)
@@ -190,7 +190,7 @@ class Growing(Generic[T]):
         self.close()
 
     def update(self, content: T) -> None:
-        """Take the new content, and write it unless the file has just been written."""
+        """Take the new content; write it now, or later if the file has just been written."""
         self.content = content
         if not self.at_end and time.monotonic() >= self.next:
             self.close()

@@ -70,7 +70,7 @@ def set_threads(threads: int) -> None:
     """Set the number of threads on the CPU.
 
     Raises:
-        ValueError: unless it is a whole number that a computer can run.
+        ValueError: unless it is a whole number from 1 to MOST_AT_ONCE.
     """
     torch.set_num_threads(whole_number(threads, "--threads", 1, MOST_AT_ONCE))
 
@@ -88,54 +88,58 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
     announce_compiling(console)
     check_device(arguments.device)
     whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
-    policies, learned = choose_policies(arguments, console)
-    stream, items, sides, spec = choose_game(arguments, learned)
+    policies, trained = choose_policies(arguments, console)
+    stream, items, sides, spec = choose_game(arguments, trained)
     if arguments.plan is not None:
         policies = with_search(policies, arguments, stream, spec.bin)
     return Setup(policies, stream, items, sides, spec, arguments)
 
 
 def choose_game(
-    arguments: argparse.Namespace, learned: dict[str, Any]
+    arguments: argparse.Namespace, trained: dict[str, Any]
 ) -> tuple[Stream, str, tuple[int, int], GameSpec]:
     """Return the item stream, its name, the sides of generated items, and the game.
 
     Args:
         arguments: the parsed options; an option that is not used is None.
-        learned: the game that the first checkpoint was trained on; empty without a checkpoint.
+        trained: the game that the first checkpoint was trained on; empty without a checkpoint.
     """
     chosen = given_options(arguments)
     if "rule" in chosen:  # margin and thresholds belong to the rule
-        learned = learned | {"margin": None, "thresholds": None}
-    items = str(learned.get("items", "rs") if arguments.items is None else arguments.items)
-    low, high = arguments.sides or learned.get("sides", DEFAULT_SIDES)
-    size, before = chosen.get("bin"), learned.get("bin")
+        trained = trained | {"margin": None, "thresholds": None}
+    items = str(trained.get("items", "rs") if arguments.items is None else arguments.items)
+    low, high = arguments.sides or trained.get("sides", DEFAULT_SIDES)
+    # The bin is the one of --bin; else, for items of --items, the one in their file; else the one
+    # of the training.
+    size, trained_size = chosen.get("bin"), trained.get("bin")
     if size is None and arguments.items is None:
-        size = before
-    size, before = (tuple(sides) if sides else None for sides in (size, before))
-    stream, bin_size = choose_stream(items, size, (low, high), before)
-    spec = GameSpec.of(learned | chosen | {"bin": bin_size})
+        size = trained_size
+    size, trained_size = (tuple(sides) if sides else None for sides in (size, trained_size))
+    stream, bin_size = choose_stream(items, size, (low, high), trained_size)
+    spec = GameSpec.of(trained | chosen | {"bin": bin_size})
     return stream, items, (low, high), spec
 
 
 def choose_policies(
     arguments: argparse.Namespace, console: Console
 ) -> tuple[dict[str, Policy], dict[str, Any]]:
-    """Return the policies that the options name, by the name of their row, and their game.
+    """Return the policies that the options name, and the game of the first checkpoint.
 
-    The game is the one that the first checkpoint was trained on (the keys of
-    :class:`marl_pack.config.Game`). It is empty without a checkpoint.
+    The keys of the policies are the names of their rows in the table. The game is the one that the
+    first checkpoint was trained on, with the keys of :class:`marl_pack.config.Game`. It is empty
+    without a checkpoint.
 
     Raises:
-        ValueError, FileNotFoundError: if there is no policy with such a name.
+        ValueError, FileNotFoundError: if a name is unknown, or the options do not fit together.
     """
     pair = arguments.orientation, arguments.placement
     if (pair[0] is None) != (pair[1] is None):
         raise ValueError("--orientation and --placement go together: name both agents")
     names = arguments.policy or ([] if pair[0] else ["dblf"])
     sources = [name for name in dict.fromkeys((*names, *pair)) if name is not None]
-    learned_sources = [s for s in sources if s not in ORIENTATION_AGENTS and not is_own(s)]
-    if arguments.symmetric and not learned_sources:
+    # ORIENTATION_AGENTS has the names of all heuristics; is_own: a function of the user's.
+    checkpoints_named = [s for s in sources if s not in ORIENTATION_AGENTS and not is_own(s)]
+    if arguments.symmetric and not checkpoints_named:
         raise ValueError("--symmetric: needs a run's folder or checkpoint")
     # Learned agents need rsl_rl, which is slow to import.
     from marl_pack.agents.learning import checkpoint as checkpoints
@@ -148,16 +152,16 @@ def choose_policies(
         policies[f"{pair[0]} + {pair[1]}"] = InTurns(
             loader.orientation_agent(pair[0]), loader.placement_agent(pair[1])
         )
-    learned: dict[str, Any] = {}
-    for source in learned_sources:
+    trained: dict[str, Any] = {}
+    for source in checkpoints_named:
         checkpoint = checkpoints.read(source)
         try:
-            learned = learned or trained_game(checkpoint)
+            trained = trained or trained_game(checkpoint)
             description = trained_on(checkpoint)
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from None
         console.print(f"{source}: trained on {description}", soft_wrap=True)
-    return policies, learned
+    return policies, trained
 
 
 def with_search(

@@ -7,7 +7,7 @@
    All M pairs are tried in few futures, then the better half in more futures, and so on.
 3. The search takes the pair after which the bin is fullest on average.
 
-An imagined game is an ordinary game with the same masks, so the search can choose only legal pairs.
+An imagined game is an ordinary game with the same masks, so only legal placements are tried.
 """
 
 from __future__ import annotations
@@ -156,9 +156,10 @@ class Planner:
     def _imagine(self, game: Packing, pairs: Tensor) -> Tensor:
         """Place the pairs, play the games to their end, and return the filled shares [G].
 
-        With a ``depth``, each game stops after this number of items. Then the critic's value is
-        added for the items that may still come. It estimates the return (Eq. 5), which subtracts
-        wasted space, so the sum is not exactly a filled share.
+        With a ``depth``, each game stops after this number of items, the proposed one included.
+        Then the critic's value is added for the items that may still come. The critic estimates the
+        return (Eq. 5 of Zhou et al. 2024), which subtracts wasted space, so the sum is not exactly
+        a filled share.
         """
         value = torch.zeros(game.n, dtype=torch.float64, device=game.device)
         rows = torch.arange(game.n, device=game.device)

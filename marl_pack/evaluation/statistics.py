@@ -31,9 +31,10 @@ def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
 def mean_utilization(rollout: Rollout) -> dict[str, Any]:
     """Compute mean utilization with its 95 % interval over episodes, and items packed.
 
-    Keys ``episodes``, ``utilization``, ``low``, ``high``, ``std``, ``packed``; shares of the bin's
-    volume. The interval (Student's t) is clipped to shares from 0 to 1. It is None for fewer than
-    :data:`FEWEST` episodes; the standard deviation is None for one episode.
+    Keys: ``episodes``; ``utilization``, ``low``, ``high`` and ``std``, as shares of the bin's
+    volume; ``packed``, the mean number of boxes. The interval (Student's t) is clipped to shares
+    from 0 to 1. It is None for fewer than :data:`FEWEST` episodes; the standard deviation is None
+    for one episode.
     """
     utilization = rollout.utilization
     low, high = None, None
@@ -64,7 +65,7 @@ def summary(rollout: Rollout, balanced: NDArray[np.bool_]) -> dict[str, Any]:
 
     Args:
         rollout: the packings.
-        balanced: bool [E], whether each is in strict equilibrium.
+        balanced: bool [E], whether the stack of each of the E episodes is in strict equilibrium.
     """
     figures = mean_utilization(rollout)
     low, high = figures.pop("low"), figures.pop("high")
@@ -77,15 +78,17 @@ def summary(rollout: Rollout, balanced: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def strict_equilibrium(plan: Plan) -> bool:
-    """Return whether the stack in every bin is in strict static equilibrium as a whole (HiGHS).
+    """Return whether the stack in every bin is in strict static equilibrium.
 
     Raises:
-        ValueError: unless lengths are whole numbers; contacts between faces are exact only then.
+        ValueError: unless the lengths of the plan are integers; contacts are exact only then.
     """
     from marl_pack.stability import in_equilibrium
 
     if plan.sides.dtype.kind != "i":
-        raise ValueError("the plan has fractions of a unit: needs whole numbers, scale it")
+        raise ValueError(
+            "the plan has lengths of type float: needs integers; choose a smaller unit"
+        )
     stacks = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
     return all(in_equilibrium(stack.boxes, stack.loads) for stack in stacks)
 
@@ -93,8 +96,9 @@ def strict_equilibrium(plan: Plan) -> bool:
 def falls(results: Sequence[Judged]) -> dict[str, Any]:
     """Compute the figures of packings that the physics engine has judged.
 
-    Keys ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that could not be
-    judged), ``judged_episodes``, ``judged`` (placements) and ``judge_seconds`` (of one placement).
+    Keys: ``falls`` (episodes in which something fell), ``no_verdict`` (episodes that the engine
+    could not judge), ``judged_episodes`` (all episodes that it was given), ``judged`` (placements)
+    and ``judge_seconds`` (seconds for one placement).
     """
     placements = sum(result.placements for result in results)
     return {

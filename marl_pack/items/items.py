@@ -24,7 +24,7 @@ UPRIGHT = (0, 1)
 """Orientations in which the item's own height stays vertical: this side up."""
 
 LONGEST_ID = 200
-"""Characters of the longest id."""
+"""Largest number of characters in an id."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Items:
     sides: Tensor  # int16 [..., 3]              own sides w, d, h in cells; zeros: no item
     weights: Tensor  # float64 [...]             weight; by default the volume
     orientations: Tensor | None = None  # bool [..., 6]  orientations it may be placed in; None: all
-    ids: Tensor | None = None  # int64 [...]     number; None: position in the sequence
+    ids: Tensor | None = None  # int64 [...]     index of the id; None: position in the sequence
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Items:
         """Return the items with ``change`` applied to every field that is not None."""
@@ -57,7 +57,7 @@ class Items:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def numbered(self, t: Tensor) -> Items:
-        """Return the items; without ids, their positions ``t`` in the sequences become the ids."""
+        """Return the items with ids: their own, or their positions ``t`` in the sequences."""
         return self if self.ids is not None else Items(**self.tensors() | {"ids": t})
 
     def ids_at(self, t: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def _truth(value: Any) -> bool:
 
 
 def _weight(value: Any) -> float:
-    """Return a weight, positive or not."""
+    """Return a weight as a number; ``check`` says later whether it is positive."""
     return real_number(value, "weight")
 
 
@@ -189,7 +189,7 @@ def _orientation_mask(value: Any) -> NDArray[np.bool_]:
     if len(value) == len(ALL_ORIENTATIONS) and all(isinstance(flag, bool) for flag in value):
         return np.array(value)
     numbers = [ALL_ORIENTATIONS.index(_whole(number)) for number in value]
-    if len(set(numbers)) < len(numbers):  # such as flags 0 and 1
+    if len(set(numbers)) < len(numbers):  # a number twice, e.g. six flags written as 0 and 1
         raise ValueError(value)
     return np.array([number in numbers for number in ALL_ORIENTATIONS])
 
