@@ -87,7 +87,7 @@ def strict_equilibrium(plan: Plan) -> bool:
 
     if plan.sides.dtype.kind != "i":
         raise ValueError(
-            "the plan has lengths of type float: needs integers; choose a smaller unit"
+            "the plan has lengths of type float: needs whole numbers; choose a smaller unit"
         )
     stacks = [plan.in_bin(k) for k in range(len(plan.bin_sizes))]
     return all(in_equilibrium(stack.boxes, stack.loads) for stack in stacks)
