@@ -82,7 +82,7 @@ class Results:
             write_json(self.path, dict(sorted(rows.items())))
 
     def remove(self, key: str) -> None:
-        """Remove one row."""
+        """Remove the row of a key from the table."""
         with self._locked():
             write_json(self.path, {k: row for k, row in self.rows().items() if k != key})
 

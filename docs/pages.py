@@ -113,7 +113,7 @@ PAGES = {"environment.md": environment_page, "onnx.md": onnx_page}
 
 
 def main() -> None:
-    """Write every page."""
+    """Write every generated page of the documentation."""
     for name, make in PAGES.items():
         path = DOCS / name
         path.write_text(make(path.read_text("utf-8")), "utf-8")

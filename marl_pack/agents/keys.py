@@ -63,4 +63,4 @@ POLICIES = (*KEYS, "random")
 """Names of :func:`marl_pack.agents.heuristics.make_policy`, and of ``make_placement_agent``."""
 
 ORIENTATION_AGENTS = (*POLICIES, "first")
-"""Names of :func:`marl_pack.agents.heuristics.make_orientation_agent`."""
+"""The heuristics that can play the orientation agent, by name."""
