@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from operator import attrgetter
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -99,9 +101,20 @@ class Bins:
         """Return all tensors, in the order of the fields."""
         return _tensors_of(self)
 
+    @cached_property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """The tensors as NumPy arrays that share their memory; only on the CPU."""
+        return tuple(tensor.numpy() for tensor in self.tensors())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields for a copy or a pickle: arrays would not share memory there."""
+        return {name: value for name, value in vars(self).items() if name != "arrays"}
+
 
 TENSORS = tuple(f.name for f in fields(Bins) if f.type == "Tensor")
 """Names of the fields of :class:`Bins` that are tensors; they come first."""
+COUNT = TENSORS.index("count")
+"""Position of the numbers of boxes among the tensors."""
 ROWS = tuple(f.name for f in fields(Bins) if f.metadata == ROW_PER_BOX)
 """Names of the fields of :class:`Bins` that have one row for each box."""
 _tensors_of: Callable[[Bins], tuple[Tensor, ...]] = attrgetter(*TENSORS)
@@ -214,7 +227,7 @@ def place(
     return code(bins, sides, corners, weights, com, labels, unit)
 
 
-def _refuse(bins: Bins, full: bool) -> None:
+def refuse(bins: Bins, *, full: bool) -> NoReturn:
     """Raise ValueError for an impossible placement: a bin is full, or a box is outside the map."""
     if full:
         most = bins.boxes.shape[1]
@@ -244,6 +257,37 @@ def _obstacle(most: int, shape: tuple[int, int], count: Any, sides: Any, corners
     return obstacle
 
 
+@njit(cache=True, inline="always")
+def place_row(
+    heightmap: Any, empty_map: Any, boxes: Any, loads: Any, labels: Any, count: Any, filled: Any,
+    b: int, x: int, y: int, w: int, d: int, h: int, weight: float, centre: tuple[float, float],
+    label: tuple[int, int],
+) -> tuple[int, int]:  # fmt: skip
+    """Place one box in bin ``b`` and add its row to the table of boxes.
+
+    Args:
+        heightmap, empty_map, boxes, loads, labels, count, filled: the tensors of the bins; updated.
+        b: the bin.
+        x, y: the box's low corner.
+        w, d, h: its sides along x, y, z, ≥ 1.
+        weight: its weight.
+        centre: x and y of its centre of mass, in cells of the bin.
+        label: its item's id and orientation.
+
+    Returns:
+        The resting height and the wasted cells.
+    """
+    z, waste = place_box(heightmap[b], empty_map[b], x, y, w, d, h)
+    k = count[b]
+    box, load, own_label = boxes[b, k], loads[b, k], labels[b, k]
+    box[0], box[1], box[2], box[3], box[4], box[5] = x, y, z, w, d, h
+    load[0], load[1], load[2] = weight, centre[0], centre[1]
+    own_label[0], own_label[1] = label
+    count[b] += 1
+    filled[b] += np.int64(w) * d * h
+    return z, waste
+
+
 @njit(cache=True, nogil=True)
 def _place_each(
     heightmap: Any, empty_map: Any, boxes: Any, loads: Any, labels: Any, count: Any, filled: Any,
@@ -257,18 +301,15 @@ def _place_each(
         resting_height[b], waste[b], volume[b] = 0, 0, 0
         if w < 1 or d < 1 or h < 1:
             continue
-        z, wasted = place_box(heightmap[b], empty_map[b], x, y, w, d, h)
-        resting_height[b], waste[b], volume[b] = z, wasted, np.int64(w) * d * h
-        k = count[b]
-        box, load, label = boxes[b, k], loads[b, k], labels[b, k]
-        box[0], box[1], box[2], box[3], box[4], box[5] = x, y, z, w, d, h
-        load[0] = weights[b] if weights.size else float(w) * d * h
-        load[1] = (x * unit + com[b, 0]) / unit if com.size else x + w / 2
-        load[2] = (y * unit + com[b, 1]) / unit if com.size else y + d / 2
-        label[0] = ids[b] if ids.size else UNKNOWN
-        label[1] = orientations[b] if orientations.size else UNKNOWN
-        count[b] += 1
-        filled[b] += volume[b]
+        volume[b] = np.int64(w) * d * h
+        centre = x + w / 2, y + d / 2
+        if com.size:
+            centre = (x * unit + com[b, 0]) / unit, (y * unit + com[b, 1]) / unit
+        label = ids[b] if ids.size else UNKNOWN, orientations[b] if orientations.size else UNKNOWN
+        resting_height[b], waste[b] = place_row(
+            heightmap, empty_map, boxes, loads, labels, count, filled, b, x, y, w, d, h,
+            weights[b] if weights.size else float(volume[b]), centre, label,
+        )  # fmt: skip
 
 
 def _place_compiled(
@@ -281,11 +322,11 @@ def _place_compiled(
     unit: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin in compiled loops; the arguments are those of :func:`place`."""
-    state = [tensor.numpy() for tensor in bins.tensors()]
+    state = bins.arrays
     box = sides.numpy(), corners.numpy()
-    obstacle = _obstacle(bins.boxes.shape[1], bins.size[:2], state[TENSORS.index("count")], *box)
+    obstacle = _obstacle(bins.boxes.shape[1], bins.size[:2], state[COUNT], *box)
     if obstacle:
-        _refuse(bins, obstacle == FULL)
+        refuse(bins, full=obstacle == FULL)
     resting_height = torch.empty(len(bins), dtype=torch.int16)
     waste, volume = torch.empty(2, len(bins), dtype=torch.int64)
     _place_each(
@@ -321,7 +362,7 @@ def _place_tensor(
     outside = (corners < 0).any(1) | (far[:, 0] > bins.size[0]) | (far[:, 1] > bins.size[1])
     full = bins.count >= bins.boxes.shape[1]
     if bool((real & (full | outside)).any()):
-        _refuse(bins, bool((real & full).any()))
+        refuse(bins, full=bool((real & full).any()))
     sides = torch.where(real[:, None], sides, 0)
     under = footprint(*bins.size[:2], sides, corners)
     resting_height, waste = place_boxes(bins.heightmap, bins.empty_map, under, sides[:, 2])

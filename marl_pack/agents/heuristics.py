@@ -77,7 +77,7 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     generator = _generator(seed, device)
     return InTurns(
         lambda game: draw(game.orientation_mask, generator),
-        lambda game, orientation: draw(game.moves.of(orientation).flatten(1), generator),
+        lambda game, orientation: draw(game.mask, generator, orientation),
     )
 
 
@@ -122,7 +122,7 @@ def make_placement_agent(
     """
     if name == "random":
         generator = _generator(seed, device)
-        return lambda game, orientation: draw(game.moves.of(orientation).flatten(1), generator)
+        return lambda game, orientation: draw(game.mask, generator, orientation)
     if name in HEURISTICS:
         heuristic = HEURISTICS[name]
         return lambda game, orientation: heuristic(game, game.moves.only(orientation), lookahead)[1]

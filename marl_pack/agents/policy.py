@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from marl_pack.backend import default_backend
+from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
+from marl_pack.installation import njit
 
 Placement = tuple[Tensor, Tensor]
 """(orientation int64 [G], cell int64 [G])."""
@@ -42,18 +47,55 @@ class InTurns:
         return orientation, self.placement_agent(game, orientation)
 
 
-def draw(mask: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Draw one index uniformly from the true entries of each row; 0 if a row has none.
+def draw(
+    mask: Tensor, generator: torch.Generator | None = None, row: Tensor | None = None
+) -> Tensor:
+    """Draw one index uniformly from the true entries of each game's mask; 0 if it has none.
 
     Args:
-        mask: bool [G, K].
+        mask: bool [G, K, …]; the entries of a game are numbered in their order. With ``row``,
+            bool [G, A, K, …].
         generator: of random numbers on the mask's device; torch's global generator by default.
+        row: int64 [G], the row of each game's mask to draw from.
 
     Returns:
         int64 [G].
     """
+    point = torch.rand(mask.shape[0], 1, generator=generator, device=mask.device)
+    code = default_backend(mask.device).pick(compiled=_draw_compiled, tensor=_draw_tensor)
+    return code(mask, point, row)
+
+
+def _draw_compiled(mask: Tensor, point: Tensor, row: Tensor | None) -> Tensor:
+    """Return the entries at ``point``, float32 [G, 1], of the true entries, by compiled loops."""
+    games, rows = mask.shape[0], 1 if row is None else mask.shape[1]
+    entries = mask.numpy().reshape(games, rows, -1)
+    drawn = np.zeros(games, np.int64)
+    _draw_each(entries, point.numpy(), drawn if row is None else row.numpy(), drawn)
+    return torch.from_numpy(drawn)
+
+
+@njit(cache=True, nogil=True)
+def _draw_each(entries: Any, point: Any, row: Any, drawn: Any) -> None:
+    """Write the entry drawn from ``entries[g, row[g]]`` to ``drawn[g]``; it may be ``row``."""
+    for g in range(drawn.size):
+        chosen = entries[g, row[g]]
+        count = 0
+        for k in range(chosen.size):
+            count += chosen[k]
+        rank = int(point[g, 0] * np.float32(count))
+        drawn[g] = 0
+        for k in range(chosen.size if count else 0):
+            rank -= chosen[k]
+            if rank < 0:
+                drawn[g] = k
+                break
+
+
+def _draw_tensor(mask: Tensor, point: Tensor, row: Tensor | None) -> Tensor:
+    """Return the same as :func:`_draw_compiled`, in tensor code."""
+    chosen = (mask if row is None else Moves.gather(mask, row)).flatten(1)
     # The inverse of the cumulative counts is several times faster than torch.multinomial.
-    count = mask.cumsum(1, dtype=torch.int32)
-    point = torch.rand(len(mask), 1, generator=generator, device=mask.device)
+    count = chosen.cumsum(1, dtype=torch.int32)
     rank = (point * count[:, -1:]).to(torch.int32)
     return torch.searchsorted(count, rank, right=True).squeeze(1) * (count[:, -1] > 0)

@@ -8,7 +8,7 @@ computes these numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,11 +18,12 @@ from torch import Tensor
 
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
+from marl_pack.game import compiled
 from marl_pack.game.spec import GameSpec
-from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS, orientation_table
-from marl_pack.installation import njit
+from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS, oriented
 from marl_pack.items import Items
-from marl_pack.stability import OrientedItem, orient_item
+from marl_pack.stability import OrientedItem
+from marl_pack.stability.oriented_item import rotated_offsets
 
 Numbers = TypeVar("Numbers", int, Tensor, NDArray[np.int64])
 
@@ -55,11 +56,6 @@ class Floor:
         """Return the low corner x and y of cells."""
         return cell // self.depth, cell % self.depth
 
-    def corners(self, cell: Tensor, backend: Backend) -> Tensor:
-        """Return the low corners (x, y) of cells int64 [N], as int64 [N, 2]."""
-        code = backend.pick(compiled=_corners_compiled, tensor=_corners_tensor)
-        return code(cell, self.depth)
-
     def pair(self, orientation: Numbers, cell: Numbers) -> Numbers:
         """Return the numbers of pairs (orientation, cell)."""
         return orientation * self.cells + cell
@@ -84,6 +80,15 @@ class Moves:
     def floor(self) -> Floor:
         """The floor, which numbers cells and pairs."""
         return Floor(self.mask.shape[2], self.mask.shape[3])
+
+    @cached_property
+    def array(self) -> NDArray[np.bool_]:
+        """The mask as a NumPy array [G, 6, W · D] that shares its memory; only on the CPU."""
+        return self.mask.numpy().reshape(self.mask.shape[0], len(ORIENTATIONS), -1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the mask for a copy or a pickle: an array would not share memory there."""
+        return {"mask": self.mask}
 
     @property
     def orientations(self) -> Tensor:
@@ -144,25 +149,23 @@ class LegalMoves:
     Args:
         spec: the options of the game.
         device: the device of the tensors.
+        backend: the implementation to use.
     """
 
-    def __init__(self, spec: GameSpec, device: torch.device) -> None:
-        self.spec, self.rule = spec, spec.make_rule()
-        self._barred = [o for o in ALL_ORIENTATIONS if o not in spec.orientations]
-        self._allowed = torch.tensor([o in spec.orientations for o in ALL_ORIENTATIONS])
-        self._allowed = self._allowed.to(device)  # [6]
+    def __init__(self, spec: GameSpec, device: torch.device, backend: Backend) -> None:
+        self.spec, self.rule, self.backend = spec, spec.make_rule(), backend
+        allowed = torch.tensor([o in spec.orientations for o in ALL_ORIENTATIONS])
+        self._allowed = allowed.to(device)  # [6]
+        self._offsets = rotated_offsets(spec.com_offset)
 
     def orient(self, items: Items) -> OrientedItem:
         """Return items in their six orientations; orientations that are not allowed get zero sides.
 
         The game's options and the item's attribute ``orientations`` say which are allowed.
         """
-        oriented = orient_item(items.sides, items.weights, self.spec.com_offset)
-        if self._barred:
-            oriented.sides[:, self._barred] = 0
-        if items.orientations is not None:
-            oriented.sides.masked_fill_(~items.orientations[..., None], 0)
-        return oriented
+        code = self.backend.pick(compiled=_orient_compiled, tensor=_orient_tensor)
+        sides = code(items, self._allowed)
+        return OrientedItem(sides, self._offsets, items.weights)
 
     def moves(self, bins: Bins, items: Items, lost: Tensor | None = None) -> Moves:
         """Return the legal moves of one item [G] in each bin.
@@ -192,65 +195,56 @@ class LegalMoves:
         Returns:
             Bool [G, 6] and bool [G].
         """
-        possible = moves.orientations
-        alive = possible.any(1)
-        if not self.spec.mask_orientations:
-            possible = self._allowed & alive[:, None]
-            if items.orientations is not None:
-                possible &= items.orientations
-        return possible, alive
+        code = self.backend.pick(compiled=_choices_compiled, tensor=_choices_tensor)
+        return code(moves, items, self._allowed, self.spec.mask_orientations)
+
+
+NO_SETS = np.empty((0, len(ORIENTATIONS)), np.bool_)
+"""Stands for items that allow all orientations."""
+
+
+def _own_orientations(items: Items) -> NDArray[np.bool_]:
+    return NO_SETS if items.orientations is None else items.orientations.numpy()
+
+
+def _orient_compiled(items: Items, allowed: Tensor) -> Tensor:
+    """Return items' sides [G, 6, 3] in six orientations; zeros where one is not allowed."""
+    sides = items.sides.numpy()
+    oriented = np.empty((len(sides), len(ORIENTATIONS), 3), np.int16)
+    compiled.orient_items(sides, allowed.numpy(), _own_orientations(items), oriented)
+    return torch.from_numpy(oriented)
+
+
+def _orient_tensor(items: Items, allowed: Tensor) -> Tensor:
+    possible = allowed if items.orientations is None else allowed & items.orientations
+    return oriented(items.sides) * possible[..., None]
+
+
+def _choices_compiled(
+    moves: Moves, items: Items, allowed: Tensor, masked: bool
+) -> tuple[Tensor, Tensor]:
+    """Return the orientations that may be chosen, bool [G, 6], and whether games go on [G]."""
+    masks = moves.array
+    possible, alive = np.empty(masks.shape[:2], np.bool_), np.empty(masks.shape[0], np.bool_)
+    compiled.find_choices(
+        masks, allowed.numpy(), _own_orientations(items), masked, possible, alive
+    )
+    return torch.from_numpy(possible), torch.from_numpy(alive)
+
+
+def _choices_tensor(
+    moves: Moves, items: Items, allowed: Tensor, masked: bool
+) -> tuple[Tensor, Tensor]:
+    possible = moves.orientations
+    alive = possible.any(1)
+    if not masked:
+        possible = allowed & alive[:, None]
+        if items.orientations is not None:
+            possible &= items.orientations
+    return possible, alive
 
 
 @lru_cache(maxsize=64)
 def _numbers(n: int, device: torch.device) -> Tensor:
     """Return 0 … n - 1, int64 [n]."""
     return torch.arange(n, device=device)
-
-
-@njit(cache=True)
-def _write_corners(cells: Any, depth: int, corners: Any) -> None:
-    for k in range(cells.size):
-        corners[k, 0], corners[k, 1] = cells[k] // depth, cells[k] % depth
-
-
-def _corners_compiled(cells: Tensor, depth: int) -> Tensor:
-    corners = np.empty((len(cells), 2), np.int64)
-    _write_corners(cells.numpy(), depth, corners)
-    return torch.from_numpy(corners)
-
-
-def _corners_tensor(cells: Tensor, depth: int) -> Tensor:
-    return torch.stack((cells // depth, cells % depth), 1)
-
-
-TABLE = np.array(ORIENTATIONS)
-
-
-@njit(cache=True)
-def _write_sides(sides: Any, orientation: Any, table: Any, chosen: Any) -> bool:
-    """Write the sides along x, y, z; return whether all orientations are rows of the table."""
-    for g in range(orientation.size):
-        o = orientation[g]
-        if not 0 <= o < len(table):
-            return False
-        for axis in range(3):
-            chosen[g, axis] = sides[g, table[o, axis]]
-    return True
-
-
-def sides_compiled(sides: Tensor, orientation: Tensor) -> Tensor:
-    """Return items' sides [G, 3] along x, y, z in orientations int64 [G], by a compiled loop.
-
-    Raises:
-        IndexError: for an orientation that is not one of 0 … 5.
-    """
-    chosen = np.empty((len(sides), 3), np.int16)
-    if not _write_sides(sides.numpy(), orientation.numpy(), TABLE, chosen):
-        raise IndexError
-    return torch.from_numpy(chosen)
-
-
-def sides_tensor(sides: Tensor, orientation: Tensor) -> Tensor:
-    """Return the same as :func:`sides_compiled`, in tensor code; a GPU raises no clear error."""
-    axes = orientation_table(sides.device).index_select(0, orientation)  # refuses negative indices
-    return sides.gather(1, axes)

@@ -15,22 +15,23 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, NoReturn, Unpack
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend, default_backend
-from marl_pack.bins import UNKNOWN, Bins, check_device
+from marl_pack.bins import COUNT, UNKNOWN, Bins, check_device
 from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
-from marl_pack.game import invariants
-from marl_pack.game.moves import Floor, LegalMoves, Moves, sides_compiled, sides_tensor
+from marl_pack.game import compiled, invariants
+from marl_pack.game.moves import Floor, LegalMoves, Moves
 from marl_pack.game.spec import GameOptions, GameSpec, document
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
-from marl_pack.geometry import ALL_ORIENTATIONS
+from marl_pack.geometry import ALL_ORIENTATIONS, orientation_table
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
 from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
@@ -40,6 +41,10 @@ MOST_GAMES = 1 << 20
 MOST_SKIPPED = 1000
 """Number of episodes in a row without a legal cell for the first item, after which the game gives
 up."""
+NO_CENTRES = np.empty((0, 2))
+"""Stands for centres of mass in the middle."""
+Played = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Rewards, filled cells and numbers of boxes after a placement, and t, [G] each."""
 LAST_EPISODE = 2**62
 """The largest number that an episode can have."""
 
@@ -115,7 +120,7 @@ class Packing(Copied):
         self.size = self.spec.bin
         width, depth, height = self.size
         self.floor, self.volume = Floor(width, depth), width * depth * height
-        self.legal = LegalMoves(self.spec, self.device)
+        self.legal = LegalMoves(self.spec, self.device, self.backend)
         self.stream = make_stream(items, self.size, sides).to(self.device, self.backend)
         self.orientation_sets = _orientation_sets(self.stream, self.spec)
         self._games = torch.arange(n, device=self.device)
@@ -411,12 +416,9 @@ class Packing(Copied):
             ValueError: on the CPU, unless all orientations are indices 0 … 5.
         """
         sides = self.items.sides
-        code = self.backend.pick(compiled=sides_compiled, tensor=sides_tensor)
-        try:
-            return code(sides, orientation)
-        except IndexError:
+        if self.device.type == "cpu" and not 0 <= orientation.min() <= orientation.max() <= 5:
             self._check_orientations(orientation)
-            raise
+        return sides.gather(1, orientation_table(self.device)[orientation])
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
         """Place each item and bring the next one: the second turn.
@@ -432,10 +434,64 @@ class Packing(Copied):
         """
         self._check_choice("orientation", orientation)
         self._check_choice("cell", cell)
+        expected = invariants.before(self, orientation, cell) if self.checked else None
+        state, alive = self.state, self.alive
+        place = self.backend.pick(compiled=self._place_compiled, tensor=self._place_tensor)
+        reward, filled, placed, state.t = place(orientation, cell, check)
+        if expected is not None:
+            invariants.check_bins(state.bins, expected)
+
+        # A game that has ended keeps the item without a legal cell, and so its empty mask.
+        state.items = self.stream.item(state.stream, state.t)
+        self._find_moves()
+        done = alive != self.alive
+        if self.auto_reset:
+            self._restart(done)
+        if self.checked:
+            invariants.check(self)
+        return Outcome(reward, done, filled, placed, self.volume)
+
+    def _centres(self, orientation: Tensor) -> tuple[Tensor | None, float]:
+        """Return the items' centres of mass as in :func:`marl_pack.bins.place`, and their unit."""
+        if not any(self.spec.com_offset):
+            return None, 1.0
+        item = self.orient_item(self.items)
+        centres = item.centre_table(0.0, max(self.size[:2]))
+        return Moves.gather(centres.units(item.sides), orientation), centres.unit
+
+    def _place_compiled(self, orientation: Tensor, cell: Tensor, check: bool) -> Played:
+        """Place each item in compiled loops; see :meth:`place`."""
+        state, masked = self.state, self.spec.mask_orientations
+        bins, items = state.bins, state.items
+        masks, table = self.moves.array, (bins.arrays[COUNT], bins.boxes.shape[1])
+        alive, sides = self.alive.numpy(), items.sides.numpy()
+        chosen = orientation.numpy(), cell.numpy()
+        fault, g = compiled.find_fault(
+            masks, self.orientation_mask.numpy(), alive, sides, *table, self.size[1], *chosen,
+            masked, check,
+        )  # fmt: skip
+        if fault == compiled.ILLEGAL:
+            self._refuse(g, orientation, cell)
+        if fault == compiled.WRONG_ORIENTATION:
+            self._check_orientations(orientation)
+        if fault:
+            bin_state.refuse(bins, full=fault == compiled.FULL)
+        t = state.t.numpy().copy()
+        ids = t if items.ids is None else items.ids.numpy()
+        com, unit = self._centres(orientation)
+        reward, after = np.empty(self.n, np.float32), np.empty((2, self.n), np.int64)
+        compiled.place_items(
+            *bins.arrays, masks, alive, sides, items.weights.numpy(), ids, *chosen,
+            NO_CENTRES if com is None else com.double().numpy(), unit, masked, self._gain,
+            self._loss, state.lost.numpy(), t, reward, after,
+        )  # fmt: skip
+        return tuple(map(torch.from_numpy, (reward, *after, t)))
+
+    def _place_tensor(self, orientation: Tensor, cell: Tensor, check: bool) -> Played:
+        """Place each item in tensor code; see :meth:`place`."""
         if check:
             self._check(orientation, cell)
         state, alive = self.state, self.alive
-        expected = invariants.before(self, orientation, cell) if self.checked else None
         sides, played = self._sides(orientation), alive
         if not self.spec.mask_orientations:
             possible = Moves.gather(self.moves.orientations, orientation)
@@ -443,33 +499,15 @@ class Packing(Copied):
             played = alive & ~state.lost
         if not (self.auto_reset and self.spec.mask_orientations):
             sides = torch.where(played[:, None], sides, 0)
-        com, unit = None, 1.0
-        if any(self.spec.com_offset):
-            item = self.orient_item(self.items)
-            centres = item.centre_table(0.0, max(state.bins.size[:2]))
-            com, unit = Moves.gather(centres.units(item.sides), orientation), centres.unit
-        corners = self.floor.corners(cell, self.backend)
+        com, unit = self._centres(orientation)
+        corners = torch.stack(self.floor.corner(cell), 1)
         labels = self.items.ids_at(state.t), orientation
         _, waste, volume = bin_state.place(
             state.bins, sides, corners, self.items.weights, com, labels, unit
         )
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
-        reward = (self._gain * volume).sub_(waste, alpha=self._loss).float()
-        filled, placed = state.bins.filled.clone(), state.bins.count.clone()
-
-        if expected is not None:
-            invariants.check_bins(state.bins, expected)
-
-        # A game that has ended keeps the item without a legal cell, and so its empty mask.
-        state.t = state.t + played
-        state.items = self.stream.item(state.stream, state.t)
-        self._find_moves()
-        done = alive & ~self.alive
-        if self.auto_reset:
-            self._restart(done)
-        if self.checked:
-            invariants.check(self)
-        return Outcome(reward, done, filled, placed, self.volume)
+        reward = (self._gain * volume.double() - self._loss * waste.double()).float()
+        return reward, state.bins.filled.clone(), state.bins.count.clone(), state.t + played
 
     def _check(self, orientation: Tensor, cell: Tensor) -> None:
         """Raise ValueError if a choice in a game that has not ended is not legal."""
@@ -482,13 +520,16 @@ class Packing(Copied):
             legal |= real & without_cell & Moves.gather(self.orientation_mask, chosen)
         illegal = self.alive & ~legal
         if bool(illegal.any()):
-            g = int(illegal.nonzero()[0])
-            x, y = self.floor.corner(int(cell[g]))
-            raise ValueError(
-                f"game {g}: item {self.items.sides[g].tolist()} in orientation "
-                f"{int(orientation[g])} may not be placed at ({x}, {y}), cell {int(cell[g])}; "
-                "choose where the mask is true"
-            )
+            self._refuse(int(illegal.nonzero()[0]), orientation, cell)
+
+    def _refuse(self, g: int, orientation: Tensor, cell: Tensor) -> NoReturn:
+        """Raise ValueError for the choice of game ``g``, which is not legal."""
+        x, y = self.floor.corner(int(cell[g]))
+        raise ValueError(
+            f"game {g}: item {self.items.sides[g].tolist()} in orientation "
+            f"{int(orientation[g])} may not be placed at ({x}, {y}), cell {int(cell[g])}; "
+            "choose where the mask is true"
+        )
 
     # --- masks and episodes -----------------------------------------------------------------------
 
@@ -520,19 +561,23 @@ class Packing(Copied):
 
     def _begin_some(self, ended: Tensor) -> None:
         """Begin the next episode where ``ended``, computing nothing for the other games."""
-        state = self.state
-        games = ended.nonzero().squeeze(1)
-        state.episode[games] += self.n
-        state.t[games] = 0
-        state.lost[games] = False
-        bin_state.clear(state.bins, games)
-        state.stream[games] = self.stream.start(self.seed, state.episode[games])
-        items = self.stream.item(state.stream[games], state.t[games])
-        moves = self.legal.moves(self._empty[: len(games)], items)
-        for old, new in zip(state.items.tensors().values(), items.tensors().values(), strict=True):
-            old[games] = new
-        self.mask[games] = moves.mask
-        self.orientation_mask[games], self.alive[games] = self.legal.choices(moves, items)
+        state, games = self.state, np.flatnonzero(ended.numpy())
+        heightmap, empty_map, *_, count, filled = state.bins.arrays
+        episode, t, stream = state.episode.numpy(), state.t.numpy(), state.stream.numpy()
+        episode[games] += self.n
+        for values in (t, state.lost.numpy(), heightmap, empty_map, count, filled):
+            values[games] = 0
+        begun = self.stream.start(self.seed, torch.from_numpy(episode[games]))
+        stream[games] = begun.numpy()
+        items = self.stream.item(begun, torch.from_numpy(t[games]))
+        empty = self._empty if len(games) == self.n else self._empty[: len(games)]
+        moves = self.legal.moves(empty, items)
+        possible, alive = self.legal.choices(moves, items)
+        for old, new in (
+            (self.mask, moves.mask), (self.orientation_mask, possible), (self.alive, alive),
+            *zip(state.items.tensors().values(), items.tensors().values(), strict=True),
+        ):  # fmt: skip
+            old.numpy()[games] = new.numpy()
 
     def _begin_by_mask(self, ended: Tensor) -> None:
         """Begin the next episode where ``ended``; tensor shapes are fixed, so no device waits."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from marl_pack.backend import default_backend
 from marl_pack.installation import njit
 
 GOLDEN, _MIX_1, _MIX_2 = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
@@ -42,7 +43,33 @@ def below(bits: Tensor, limit: int) -> Tensor:
 
 def episode_keys(seed: int, episodes: Tensor) -> Tensor:
     """Return one independent key, int64 [K], for each episode of a seed."""
-    return mix(mix(torch.full_like(episodes, _signed(seed)), 0), episodes)
+    code = default_backend(episodes.device).pick(compiled=_keys_compiled, tensor=_keys_tensor)
+    return code(_signed(seed), episodes)
+
+
+def _keys_tensor(seed: int, episodes: Tensor) -> Tensor:
+    return mix(mix(torch.full_like(episodes, seed), 0), episodes)
+
+
+def _keys_compiled(seed: int, episodes: Tensor) -> Tensor:
+    keys = np.empty(len(episodes), np.int64)
+    _write_keys(seed, episodes.numpy(), keys)
+    return torch.from_numpy(keys)
+
+
+@njit(cache=True, inline="always")
+def _mixed(z: Any) -> Any:
+    """Return the output function of SplitMix64 for a state uint64."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(_MIX_1)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(_MIX_2)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True)
+def _write_keys(seed: int, episodes: Any, keys: Any) -> None:
+    own = _mixed(np.uint64(seed) + np.uint64(GOLDEN))
+    for k in range(keys.size):
+        keys[k] = np.int64(_mixed(own + (np.uint64(episodes[k]) + np.uint64(1)) * np.uint64(GOLDEN)))
 
 
 @njit(cache=True)
@@ -52,8 +79,5 @@ def draw(state: Any, limit: int) -> int:
     The generator is SplitMix64; ``state`` (uint64 [1]) is advanced in place.
     """
     state[0] += np.uint64(GOLDEN)
-    z = state[0]
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(_MIX_1)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(_MIX_2)
-    z = z ^ (z >> np.uint64(31))
+    z = _mixed(state[0])
     return int(((z >> np.uint64(32)) * np.uint64(limit)) >> np.uint64(32))

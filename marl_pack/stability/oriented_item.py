@@ -68,7 +68,14 @@ def orient_item(
         com_offset: x, y, z of the centre of mass minus those of the geometric centre, as fractions
             of w, d, h before the item is rotated; it rotates with the item.
     """
-    offsets = None
-    if any(com_offset):
-        offsets = tuple((com_offset[x], com_offset[y]) for x, y, _ in ORIENTATIONS)
-    return OrientedItem(oriented(items), offsets, weight)
+    return OrientedItem(oriented(items), rotated_offsets(com_offset), weight)
+
+
+def rotated_offsets(com_offset: tuple[float, float, float]) -> Offsets | None:
+    """Return the offset x, y of the centre of mass in the six orientations; None if it is 0.
+
+    The argument is that of :func:`orient_item`.
+    """
+    if not any(com_offset):
+        return None
+    return tuple((com_offset[x], com_offset[y]) for x, y, _ in ORIENTATIONS)

@@ -38,5 +38,5 @@ class Teacher:
     def _random(self, game: Packing, *before: Tensor) -> Tensor:
         """Draw uniformly among the actions that lead to a legal placement."""
         if self.kind.acts_on_cells:
-            return draw(game.moves.of(*before).flatten(1))
+            return draw(game.mask, None, *before)
         return draw(game.moves.orientations)
