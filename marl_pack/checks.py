@@ -75,6 +75,10 @@ def real_number(value: Any, what: str) -> float:
     Raises:
         ValueError: naming the value and what it needs to be.
     """
+    if type(value) is int and abs(value) < LARGEST_SEED:  # the usual cases, quickly
+        return float(value)
+    if type(value) is float and math.isfinite(value):
+        return value
     decimal = str(value) if isinstance(value, np.floating) else value
     if not isinstance(value, bool) and isinstance(value, Real):
         try:

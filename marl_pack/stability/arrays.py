@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from marl_pack.bins import UNKNOWN, Bins
 from marl_pack.checks import real_number, shown
 from marl_pack.geometry import check_size
 from marl_pack.geometry.compiled import place_box
+from marl_pack.installation import njit
 from marl_pack.stability.oriented_item import OrientedItem
 from marl_pack.stability.parameters import NO_OFFSET, check_com_offset
 from marl_pack.stability.rules import Rule, equilibrium, lbcp, make_rule
@@ -56,33 +59,26 @@ def stable_mask(
     Raises:
         ValueError: if a map, the item, a box or a parameter is impossible; the message names it.
     """
-    heights, empty = _check_maps(heightmap, empty_map, bin_height)
+    maps = _check_maps(heightmap, empty_map, bin_height)
     sides = _check_item(item)
-    bound = _bind(rule, parameters, with_boxes=boxes is not None or not heights.any())
-    stack, load = _stack(boxes, weights, heights, empty)
+    bound = _bind(rule, parameters)
+    if boxes is None and _needs_stack(bound) and maps[0].any():
+        raise ValueError("boxes: the rule needs the whole stack; give boxes, rows x y z w d h")
+    table = NO_BOXES if boxes is None and weights is None else _table(boxes, weights, *maps)
+    offset = check_com_offset(com_offset)[:2]
     item_weight = None
     if weight is not None:
         item_weight = torch.tensor([_check_weight(weight)], dtype=torch.float64)
-    offset = check_com_offset(com_offset)
-    if (sides > (*heights.shape, bin_height)).any():
-        return np.zeros(heights.shape, np.bool_)
-    bins = Bins(
-        heightmap=torch.from_numpy(heights.astype(np.int16))[None],
-        empty_map=torch.from_numpy(empty.astype(np.int16))[None],
-        boxes=torch.from_numpy(stack.astype(np.int16))[None],
-        loads=torch.from_numpy(load)[None],
-        labels=torch.full((1, len(stack), 2), UNKNOWN),
-        count=torch.tensor([len(stack)]),
-        filled=torch.tensor([int(stack[:, 3:].prod(1).sum())]),
-        height=int(bin_height),
-        backend=default_backend("cpu"),
-    )
+    width, depth = maps.shape[1:]
+    if sides[0] > width or sides[1] > depth or sides[2] > bin_height:
+        return np.zeros((width, depth), np.bool_)
+    heights, empty = torch.from_numpy(maps[:1]), torch.from_numpy(maps[1:])
+    bins = Bins(heights, empty, *table, int(bin_height), default_backend("cpu"))
     oriented = OrientedItem(
-        torch.from_numpy(sides.astype(np.int16))[None, None],
-        (offset[:2],) if any(offset[:2]) else None,
+        torch.from_numpy(np.array([[sides]], np.int16)), (offset,) if any(offset) else None,
         item_weight,
-    )
-    return bound(bins, oriented)[0, 0].numpy()
+    )  # fmt: skip
+    return bound(bins, oriented).numpy()[0, 0]
 
 
 def _check_weight(weight: float) -> float:
@@ -97,22 +93,23 @@ def _check_weight(weight: float) -> float:
     return number
 
 
-def _check_item(item: ArrayLike) -> NDArray[np.int64]:
-    """Check the item's sides and return them as int64 [3].
+def _check_item(item: ArrayLike) -> list[int]:
+    """Check the item's sides and return them as three ints.
 
     Raises:
         ValueError: unless they are three whole numbers of cells ≥ 1.
     """
-    sides = whole_cells("item", item)
-    if sides.shape != (3,) or sides.min() < 1:
+    if type(item) in (tuple, list) and all(type(side) is int for side in item):  # the usual case
+        sides = list(item)
+    else:
+        sides = whole_cells("item", item).tolist()
+    if not (isinstance(sides, list) and len(sides) == 3 and min(sides) >= 1):
         raise ValueError(f"item {item!r}: needs three whole sides w, d, h ≥ 1 in cells")
     return sides
 
 
-def _check_maps(
-    heightmap: ArrayLike, empty_map: ArrayLike, bin_height: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Check the heightmap and the empty map and return them as int64 [W, D].
+def _check_maps(heightmap: ArrayLike, empty_map: ArrayLike, bin_height: int) -> NDArray[np.int16]:
+    """Check the heightmap and the empty map and return both, int16 [2, W, D].
 
     Raises:
         ValueError: if their shapes differ, or a number in them or the bin's size is impossible.
@@ -122,57 +119,102 @@ def _check_maps(
             "empty_map: needs whole numbers [W, D], the empty cells below the top of each column; "
             "zeros if every column is filled down to the floor"
         )
-    heights = whole_cells("heightmap", heightmap)
-    empty = whole_cells("empty_map", empty_map)
+    heights, empty = _cells("heightmap", heightmap), _cells("empty_map", empty_map)
     if heights.ndim != 2 or heights.shape != empty.shape:
         raise ValueError(
             f"heightmap {heights.shape} and empty_map {empty.shape}: need the same shape [W, D]"
         )
     check_size((*heights.shape, bin_height))
-    if heights.min() < 0 or heights.max() > bin_height:
+    maps = np.empty((2, *heights.shape), np.int16)
+    high, gaps = _copy_maps(heights, empty, int(bin_height), maps)
+    if high:
         raise ValueError(f"heightmap: heights must lie in 0 … {bin_height}, the bin's height")
-    if empty.min() < 0 or (empty > np.maximum(heights - 1, 0)).any():
+    if gaps:
         raise ValueError("empty_map: must lie between 0 and the column's height less its top cell")
-    return heights, empty
+    return maps
 
 
-def _bind(
-    rule: str | Rule, parameters: dict[str, object], with_boxes: bool
-) -> Callable[..., torch.Tensor]:
+def _cells(name: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Check a map as :func:`whole_cells` does, and return it as a contiguous array."""
+    if type(values) is not np.ndarray or values.dtype.kind != "i":
+        values = whole_cells(name, values)
+    return np.ascontiguousarray(values, np.int64)
+
+
+@njit(cache=True)
+def _copy_maps(heights: Any, empty: Any, bin_height: int, maps: Any) -> tuple[bool, bool]:
+    """Copy both maps [W, D] to ``maps``; return whether a height or an empty cell is impossible."""
+    high, gaps = False, False
+    for x in range(heights.shape[0]):
+        for y in range(heights.shape[1]):
+            height, below = heights[x, y], empty[x, y]
+            high |= height < 0 or height > bin_height
+            gaps |= below < 0 or below > max(height - 1, 0)
+            maps[0, x, y], maps[1, x, y] = height, below
+    return high, gaps
+
+
+def _bind(rule: str | Rule, parameters: dict[str, object]) -> Callable[..., torch.Tensor]:
     """Return the rule with its parameters bound; ``equilibrium`` checks the stack itself.
 
     Args:
         rule: a name or a bound rule.
         parameters: parameters to bind; allowed only if ``rule`` is a name.
-        with_boxes: whether the stack is known: its boxes are given, or the bin is empty.
 
     Raises:
-        ValueError: if there are parameters for a bound rule, or the rule needs boxes and there are
-            none.
+        ValueError: if there are parameters for a bound rule.
     """
     bound: Callable[..., torch.Tensor]
     if isinstance(rule, str):
-        bound = make_rule(rule, **parameters)
+        bound = make_rule(rule, **parameters) if parameters else _rule_called(rule)
     elif not callable(rule):
         raise ValueError(f"rule {shown(rule)}: needs a name in RULES or a rule from make_rule")
     elif parameters:
         raise ValueError(f"{sorted(parameters)}: need the name of a rule, not a bound one")
     else:
         bound = rule
-    function = getattr(bound, "func", bound)
-    if not with_boxes and function in (lbcp, equilibrium):
-        raise ValueError("boxes: the rule needs the whole stack; give boxes, rows x y z w d h")
-    if function is equilibrium:
+    if getattr(bound, "func", bound) is equilibrium:
         keywords: dict[str, object] = getattr(bound, "keywords", {})
         bound = make_rule("equilibrium", **({"check_stack": True} | keywords))
     return bound
 
 
+@cache
+def _rule_called(name: str) -> Rule:
+    """Return the rule called ``name`` with the defaults of its parameters."""
+    return make_rule(name)
+
+
+def _needs_stack(bound: Callable[..., torch.Tensor]) -> bool:
+    """Return whether a rule needs the boxes of the bin."""
+    return getattr(bound, "func", bound) in (lbcp, equilibrium)
+
+
+def _table(
+    boxes: ArrayLike | None,
+    weights: ArrayLike | None,
+    heights: NDArray[np.int16],
+    empty: NDArray[np.int16],
+) -> tuple[torch.Tensor, ...]:
+    """Return the table of boxes of one bin: the fields of :class:`Bins` after the maps.
+
+    The arguments and the errors are those of :func:`_stack`.
+    """
+    stack, load = _stack(boxes, weights, heights, empty)
+    return (
+        torch.from_numpy(stack.astype(np.int16))[None],
+        torch.from_numpy(load)[None],
+        torch.full((1, len(stack), 2), UNKNOWN),
+        torch.tensor([len(stack)]),
+        torch.tensor([int(stack[:, 3:].prod(1).sum())]),
+    )
+
+
 def _stack(
     boxes: ArrayLike | None,
     weights: ArrayLike | None,
-    heights: NDArray[np.int64],
-    empty: NDArray[np.int64],
+    heights: NDArray[np.int16],
+    empty: NDArray[np.int16],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the boxes, sorted so that they can be placed one by one, and their loads.
 
@@ -204,3 +246,7 @@ def _stack(
             raise ValueError(f"weights: needs one number for each of {len(stack)} boxes")
         load[:, 0] = [_check_weight(own_weights[row]) for row in order]
     return stack, load
+
+
+NO_BOXES = _table(None, None, np.zeros((0, 0), np.int16), np.zeros((0, 0), np.int16))
+"""The table of an empty bin, or of one whose boxes are not known."""
