@@ -113,8 +113,8 @@ class Bins:
 
 TENSORS = tuple(f.name for f in fields(Bins) if f.type == "Tensor")
 """Names of the fields of :class:`Bins` that are tensors; they come first."""
-COUNT = TENSORS.index("count")
-"""Position of the numbers of boxes among the tensors."""
+HEIGHTMAP, COUNT, FILLED = map(TENSORS.index, ("heightmap", "count", "filled"))
+"""Positions of some tensors in :meth:`Bins.tensors` and :attr:`Bins.arrays`."""
 ROWS = tuple(f.name for f in fields(Bins) if f.metadata == ROW_PER_BOX)
 """Names of the fields of :class:`Bins` that have one row for each box."""
 _tensors_of: Callable[[Bins], tuple[Tensor, ...]] = attrgetter(*TENSORS)

@@ -164,11 +164,13 @@ from pettingzoo.utils.conversions import (
     turn_based_aec_to_parallel_wrapper,
 )
 
+from marl_pack.bins import COUNT, FILLED, HEIGHTMAP
 from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameOptions, GameSpec, document, with_options
 from marl_pack.game.state import Copied
 from marl_pack.geometry import ORIENTATIONS
+from marl_pack.installation import njit
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.plan import Plan
 
@@ -234,15 +236,40 @@ def parallel_env(
     return (AtOnce if simultaneous else Turns)(env(illegal_reward=illegal_reward, **options))
 
 
+def _of_the_turn(name: str) -> property:
+    """Return a property that reads an attribute of the unwrapped environment.
+
+    Before the first ``reset`` it raises PettingZoo's AttributeError.
+    """
+
+    def read(self: OrderEnforcing) -> Any:
+        if not self._has_reset:
+            raise AttributeError(f"{name} cannot be accessed before reset")
+        return getattr(self._raw, name)
+
+    return property(read)
+
+
 class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
-    """PettingZoo's outermost wrapper: it refuses calls in a wrong order, and wrong actions."""
+    """PettingZoo's outermost wrapper: it refuses calls in a wrong order, and wrong actions.
+
+    A legal action goes straight to the environment, since the wrappers in between would only check
+    it again.
+    """
 
     _has_reset: bool
     _has_updated: bool
 
+    agents = _of_the_turn("agents")
+    agent_selection = _of_the_turn("agent_selection")
+    rewards = _of_the_turn("rewards")
+    terminations = _of_the_turn("terminations")
+    truncations = _of_the_turn("truncations")
+    infos = _of_the_turn("infos")
+
     def __init__(self, env: AECEnv) -> None:
         super().__init__(env)
-        self._raw = env.unwrapped  # the wrappers' own look-ups take microseconds
+        self._raw: raw_env = env.unwrapped  # the wrappers' own look-ups take microseconds
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begin an episode; if the arguments are refused, nothing changes."""
@@ -264,12 +291,20 @@ class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
             agent = raw.agent_selection
             if action is not None or not (raw.terminations[agent] or raw.truncations[agent]):
                 action = raw.check_action(agent, action)
+                if raw.can_play(action):
+                    self._has_updated = True
+                    raw.step(action)
+                    return
+                self.env.observe(agent)  # the wrapper for illegal actions compares with the mask
         super().step(action)
+
+    def observe(self, agent: str) -> Any:
+        """Return the agent's observation."""
+        return self._raw.observe(agent) if self._has_reset else super().observe(agent)
 
     def last(self, observe: bool = True) -> Any:
         """Return the same as PettingZoo's ``last``; raise ValueError once no agent is left."""
-        _some_left(self.agents)
-        return super().last(observe)
+        return self._raw.last(observe) if self._has_reset else super().last(observe)
 
     def __str__(self) -> str:
         return str(self.env)
@@ -369,6 +404,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
+        self._all_masked = self._spec.mask_orientations  # an orientation chosen has a legal cell
         self._unit = max(self._game.size)
         self._episode = -1  # number of the stream's last episode that was begun
         self._seed: int | None = None  # seed of the stream; None before the first episode
@@ -494,12 +530,11 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._clear_rewards()
         if self._chosen is not None:
             self._place(self._chosen, choice)
-        elif self._masks[choice].any():
+        elif self._orientation_mask[choice] and (self._all_masked or self._masks[choice].any()):
             self._chosen = choice
         else:  # only without mask_orientations: the episode ends and nothing is placed
             self._place(choice, 0)
         self.agent_selection = self._acting
-        self._accumulate_rewards()
         self.infos = {name: self._info(name) for name in self.agents}
         if repaired:
             self.infos[agent]["repaired"] = True
@@ -521,6 +556,7 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self.rewards = dict.fromkeys(self.agents, float(outcome.reward))
         self.terminations = dict.fromkeys(self.agents, ended)
         self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
+        self._accumulate_rewards()
 
     def last(self, observe: bool = True) -> Any:
         """Return observation, reward, termination, truncation and info of the acting agent.
@@ -546,10 +582,10 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
 
     def _legal(self, agent: str, action: Any) -> tuple[int, bool]:
         """Return the action to play, and whether it replaces an illegal action."""
-        action, mask = self.check_action(agent, action), self.action_mask(agent)
-        if mask[action]:
+        action = self.check_action(agent, action)
+        if self._is_legal(action):
             return action, False
-        legal = np.flatnonzero(mask)
+        legal = np.flatnonzero(self.action_mask(agent))
         if self.illegal != "repair":
             raise ValueError(
                 f"{agent}: action {action} is not legal; {len(legal)} are, see its action_mask"
@@ -567,12 +603,26 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
     def _read_game(self) -> None:
         """Read this cycle's numbers from the game."""
         game = self._game
-        self._packed = int(game.bins.count.numpy()[0])
-        self.utilization = int(game.bins.filled.numpy()[0]) / game.volume
-        self._heights = game.bins.heightmap.numpy()[0] / np.float32(self._unit)
+        self._packed = int(game.bins.arrays[COUNT][0])
+        self.utilization = int(game.bins.arrays[FILLED][0]) / game.volume
         self._item = game.items.sides.numpy()[0]
-        self._masks = game.mask.numpy()[0]
+        self._masks = game.moves.array[0]
         self._orientation_mask = game.orientation_mask.numpy()[0]
+
+    @property
+    def _legal_actions(self) -> NDArray[np.bool_]:
+        """The legal actions of the acting agent, bool [6] or [W · D]."""
+        return self._orientation_mask if self._chosen is None else self._masks[self._chosen]
+
+    def can_play(self, action: int) -> bool:
+        """Return whether an action in the acting agent's space is legal, and the agent goes on."""
+        agent = self.agent_selection
+        ended = self.terminations[agent] or self.truncations[agent]
+        return not ended and self._is_legal(action)
+
+    def _is_legal(self, action: int) -> bool:
+        legal = self._legal_actions
+        return action < legal.size and bool(legal[action])
 
     @property
     def _acting(self) -> str:
@@ -586,20 +636,18 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         return self._item
 
     def _planes(self, oriented: bool, whose_turn: bool) -> NDArray[np.float32]:
-        planes = np.empty((4 + whose_turn, *self._heights.shape), np.float32)
-        planes[0] = self._heights
-        planes[1:4] = (self._sides(oriented) / np.float32(self._unit))[:, None, None]
-        if whose_turn:
-            planes[4] = self._chosen is not None
+        heightmap = self._game.bins.arrays[HEIGHTMAP][0]
+        planes = np.empty((4 + whose_turn, *heightmap.shape), np.float32)
+        turn = self._chosen is not None
+        orientation = ORIENTATIONS[self._chosen if oriented and turn else 0]
+        _fill_planes(heightmap, self._item, orientation, self._unit, turn, planes)
         return planes
 
     def action_mask(self, agent: str) -> NDArray[np.int8]:
         """Return the agent's mask of legal actions, all 0 if it is not the agent's turn."""
-        mask = np.zeros(self.action_spaces[agent].n, np.int8)
+        mask = np.zeros(self._choices[agent], np.int8)
         if agent == self._acting:
-            legal = self._orientation_mask
-            if self._chosen is not None:
-                legal = self._masks[self._chosen].ravel()
+            legal = self._legal_actions
             mask[: legal.size] = legal
         return mask
 
@@ -663,8 +711,9 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         from marl_pack.render.turn import turn_picture
 
         boxes = self._game.bins.boxes[0, : self._packed].numpy()
+        masks = self._game.mask[0].numpy()
         return turn_picture(
-            self._title(), self._game.size, boxes, self._item.tolist(), self._masks, self._chosen
+            self._title(), self._game.size, boxes, self._item.tolist(), masks, self._chosen
         )
 
     def close(self) -> None:
@@ -672,6 +721,21 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         if self._window is not None:
             self._window.close()
             self._window = None
+
+
+@njit(cache=True)
+def _fill_planes(
+    heightmap: Any, item: Any, orientation: tuple[int, int, int], unit: int, turn: bool, planes: Any
+) -> None:
+    """Write the planes float32 [4 or 5, W, D] of an observation: heightmap, sides and turn."""
+    longest = np.float32(unit)
+    for x in range(heightmap.shape[0]):
+        for y in range(heightmap.shape[1]):
+            planes[0, x, y] = np.float32(heightmap[x, y]) / longest
+    for axis in range(3):
+        planes[1 + axis] = np.float32(item[orientation[axis]]) / longest
+    if planes.shape[0] > 4:
+        planes[4] = turn
 
 
 def _some_left(agents: Sequence[str]) -> None:
