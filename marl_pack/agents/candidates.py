@@ -10,6 +10,7 @@ from torch import Tensor
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import resting_heights_and_waste
+from marl_pack.items.streams import Cut
 
 
 class Candidates:
@@ -59,3 +60,15 @@ class Candidates:
     def feasible_cells(self) -> Tensor:
         """Mean number of cells where a box that may come next could be placed, float32."""
         return self.lookahead.feasible_cells(self.game)
+
+    @cached_property
+    def elsewhere(self) -> Tensor:
+        """0 where a piece of a generated cut was cut out, 1 elsewhere, int64 [G, 6, W, D]."""
+        game = self.game
+        elsewhere = torch.ones_like(game.mask, dtype=torch.int64)
+        if isinstance(game.stream, Cut):
+            boxes = game.stream.boxes(game.seed, game.episode)
+            games, steps = torch.arange(game.n, device=game.device), game.t
+            x, y = boxes[games, steps.clamp(max=boxes.shape[1] - 1), :2].long().unbind(1)
+            elsewhere[games, 0, x, y] = 0
+        return elsewhere

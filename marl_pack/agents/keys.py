@@ -51,11 +51,21 @@ def max_feasible(c: Candidates) -> Keys:
     return (most - cells, most + 1), (c.top, height + 1), (c.x + c.y, width + depth)
 
 
+def as_cut(c: Candidates) -> Keys:
+    """Place the pieces of generated cuts where they were cut; place other items as :func:`dblf`.
+
+    With the items ``cut1`` and ``cut2`` this fills the whole bin. No agent that sees only the
+    visible item can do so; it is a teacher for such agents.
+    """
+    return (c.elsewhere, 2), *dblf(c)
+
+
 KEYS: dict[str, Callable[[Candidates], Keys]] = {
     "dblf": dblf,
     "height_min": height_min,
     "best_fit": best_fit,
     "max_feasible": max_feasible,
+    "as_cut": as_cut,
 }
 """The keys of every heuristic, by its name."""
 

@@ -206,10 +206,14 @@ class Cut:
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """Return the episodes' items, int16 [K, L, 3]."""
-        boxes = cut(self.size, self.order, seed, episodes, (self.low, self.high))[..., 3:]
-        items = torch.zeros(len(boxes), self.longest, 3, dtype=torch.int16)
-        items[:, : boxes.shape[1]] = boxes
-        return items.to(episodes.device)
+        return self.boxes(seed, episodes)[..., 3:].contiguous()
+
+    def boxes(self, seed: int, episodes: Tensor) -> Tensor:
+        """Return the episodes' pieces where they were cut: x, y, z, w, d, h, int16 [K, L, 6]."""
+        cut_boxes = cut(self.size, self.order, seed, episodes, (self.low, self.high))
+        boxes = torch.zeros(len(cut_boxes), self.longest, 6, dtype=torch.int16)
+        boxes[:, : cut_boxes.shape[1]] = cut_boxes
+        return boxes.to(episodes.device)
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
         """Return the episodes' items, newly cut where an episode has ended.
