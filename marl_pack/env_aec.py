@@ -638,8 +638,8 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
     def _planes(self, oriented: bool, whose_turn: bool) -> NDArray[np.float32]:
         heightmap = self._game.bins.arrays[HEIGHTMAP][0]
         planes = np.empty((4 + whose_turn, *heightmap.shape), np.float32)
+        orientation = ORIENTATIONS[self._chosen if oriented and self._chosen is not None else 0]
         turn = self._chosen is not None
-        orientation = ORIENTATIONS[self._chosen if oriented and turn else 0]
         _fill_planes(heightmap, self._item, orientation, self._unit, turn, planes)
         return planes
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import in_play
@@ -17,7 +18,7 @@ from marl_pack.agents.networks.actor_critic import make_actor
 from marl_pack.agents.search import Planner
 from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.backend import Backend
-from marl_pack.game import invariants
+from marl_pack.game import compiled, invariants
 from marl_pack.game.packing import Packing
 from marl_pack.items import make_stream
 from marl_pack.stability import RULES
@@ -147,15 +148,23 @@ def test_a_damaged_state_is_reported(report: str, backend: Backend) -> None:
 
 
 @pytest.mark.usefixtures("checked")
-def test_a_placement_that_goes_wrong_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    place = bin_state.place
+@pytest.mark.parametrize("backend", Backend)
+def test_a_placement_that_goes_wrong_is_reported(
+    backend: Backend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, place_items = bin_state.place, compiled.place_items
 
     def elsewhere(bins: Any, sides: Any, corners: Any, *rest: Any) -> Any:
         return place(bins, sides, torch.zeros_like(corners), *rest)
 
-    game = Packing(2, (4, 4, 5), sides=(1, 2))
+    def elsewhere_compiled(*arguments: Any) -> None:
+        before, (cell, *rest) = arguments[:13], arguments[13:]
+        place_items(*before, np.zeros_like(cell), *rest)
+
+    game = Packing(2, (4, 4, 5), sides=(1, 2), backend=backend)
     cell = torch.tensor([0, game.floor.cell(1, 2)])
     monkeypatch.setattr(bin_state, "place", elsewhere)
+    monkeypatch.setattr(compiled, "place_items", elsewhere_compiled)
     with pytest.raises(AssertionError, match=r"game 1: table of boxes at .* = \(0, 0\) is 0.0"):
         game.place(torch.tensor([0, 0]), cell)
 

@@ -392,7 +392,19 @@ HEURISTIC_KEYS = {
     "height_min": lambda c: (c["waste"], c["x"] + c["y"]),
     "best_fit": lambda c: (c["waste"], c["top"], c["x"] + c["y"]),
     "max_feasible": lambda c: (-c["cells"], c["top"], c["x"] + c["y"]),
+    "as_cut": lambda c: (c["z"], c["x"], c["y"]),  # these items are not pieces of a cut
 }
+
+
+@pytest.mark.parametrize("backend", Backend)
+@pytest.mark.parametrize("items", ["cut1", "cut2"])
+def test_the_pieces_of_a_cut_placed_where_they_were_cut_fill_the_bin(
+    items: str, backend: Backend
+) -> None:
+    game = Packing(8, (8, 6, 9), items, sides=(2, 4), auto_reset=False, seed=2, backend=backend)
+    while bool(game.alive.any()):
+        game.place(*make_policy("as_cut")(game))
+    assert (game.bins.filled == game.volume).all()
 
 
 @pytest.mark.parametrize("steps", [3, 7, 11])

@@ -24,9 +24,7 @@ def _legal(masks: Any, orientation_mask: Any, g: int, o: int, cell: int, masked:
     """Return whether a choice is legal; ``masked`` is false if orientations are not masked."""
     if not (0 <= o < masks.shape[1] and 0 <= cell < masks.shape[2]):
         return False
-    return masks[g, o, cell] or (
-        not masked and orientation_mask[g, o] and not masks[g, o].any()
-    )
+    return masks[g, o, cell] or (not masked and orientation_mask[g, o] and not masks[g, o].any())
 
 
 @njit(cache=True, inline="always")
@@ -119,6 +117,22 @@ def place_items(
             reward[g] = np.float32(gain * (np.int64(w) * d * h) - loss * waste)
             t[g] += 1
         after[0, g], after[1, g] = filled[g], count[g]
+
+
+@njit(cache=True, nogil=True)
+def rotate_items(sides: Any, orientation: Any, chosen: Any) -> bool:
+    """Write items' sides [G, 3] along x, y, z in the chosen orientations, int64 [G].
+
+    Returns:
+        Whether all orientations are rows of :data:`ORIENTATIONS`.
+    """
+    for g in range(orientation.size):
+        o = orientation[g]
+        if not 0 <= o < len(TABLE):
+            return False
+        for axis in range(3):
+            chosen[g, axis] = sides[g, TABLE[o, axis]]
+    return True
 
 
 @njit(cache=True, nogil=True)

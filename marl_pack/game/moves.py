@@ -226,9 +226,7 @@ def _choices_compiled(
     """Return the orientations that may be chosen, bool [G, 6], and whether games go on [G]."""
     masks = moves.array
     possible, alive = np.empty(masks.shape[:2], np.bool_), np.empty(masks.shape[0], np.bool_)
-    compiled.find_choices(
-        masks, allowed.numpy(), _own_orientations(items), masked, possible, alive
-    )
+    compiled.find_choices(masks, allowed.numpy(), _own_orientations(items), masked, possible, alive)
     return torch.from_numpy(possible), torch.from_numpy(alive)
 
 

@@ -415,10 +415,12 @@ class Packing(Copied):
         Raises:
             ValueError: on the CPU, unless all orientations are indices 0 … 5.
         """
-        sides = self.items.sides
-        if self.device.type == "cpu" and not 0 <= orientation.min() <= orientation.max() <= 5:
+        code = self.backend.pick(compiled=_sides_compiled, tensor=_sides_tensor)
+        try:
+            return code(self.items.sides, orientation)
+        except IndexError:
             self._check_orientations(orientation)
-        return sides.gather(1, orientation_table(self.device)[orientation])
+            raise
 
     def place(self, orientation: Tensor, cell: Tensor, *, check: bool = True) -> Outcome:
         """Place each item and bring the next one: the second turn.
@@ -485,7 +487,8 @@ class Packing(Copied):
             NO_CENTRES if com is None else com.double().numpy(), unit, masked, self._gain,
             self._loss, state.lost.numpy(), t, reward, after,
         )  # fmt: skip
-        return tuple(map(torch.from_numpy, (reward, *after, t)))
+        filled, placed = map(torch.from_numpy, after)
+        return torch.from_numpy(reward), filled, placed, torch.from_numpy(t)
 
     def _place_tensor(self, orientation: Tensor, cell: Tensor, check: bool) -> Played:
         """Place each item in tensor code; see :meth:`place`."""
@@ -591,6 +594,24 @@ class Packing(Copied):
         new = self.legal.moves(self._empty, state.items).mask
         self.moves = Moves(torch.where(ended[:, None, None, None], new, self.mask))
         self.orientation_mask, self.alive = self.legal.choices(self.moves, state.items)
+
+
+def _sides_compiled(sides: Tensor, orientation: Tensor) -> Tensor:
+    """Return items' sides [G, 3] along x, y, z in orientations int64 [G], by a compiled loop.
+
+    Raises:
+        IndexError: for an orientation that is not one of 0 … 5.
+    """
+    chosen = np.empty((orientation.shape[0], 3), np.int16)
+    if not compiled.rotate_items(sides.numpy(), orientation.numpy(), chosen):
+        raise IndexError
+    return torch.from_numpy(chosen)
+
+
+def _sides_tensor(sides: Tensor, orientation: Tensor) -> Tensor:
+    """Return the same as :func:`_sides_compiled`, in tensor code; a GPU raises no clear error."""
+    axes = orientation_table(sides.device).index_select(0, orientation)  # refuses negative indices
+    return sides.gather(1, axes)
 
 
 def _orientation_sets(stream: Stream, spec: GameSpec) -> dict[tuple[int, ...], float]:

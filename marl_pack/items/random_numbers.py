@@ -69,7 +69,9 @@ def _mixed(z: Any) -> Any:
 def _write_keys(seed: int, episodes: Any, keys: Any) -> None:
     own = _mixed(np.uint64(seed) + np.uint64(GOLDEN))
     for k in range(keys.size):
-        keys[k] = np.int64(_mixed(own + (np.uint64(episodes[k]) + np.uint64(1)) * np.uint64(GOLDEN)))
+        keys[k] = np.int64(
+            _mixed(own + (np.uint64(episodes[k]) + np.uint64(1)) * np.uint64(GOLDEN))
+        )
 
 
 @njit(cache=True)

@@ -73,7 +73,10 @@ def stable_mask(
     if sides[0] > width or sides[1] > depth or sides[2] > bin_height:
         return np.zeros((width, depth), np.bool_)
     heights, empty = torch.from_numpy(maps[:1]), torch.from_numpy(maps[1:])
-    bins = Bins(heights, empty, *table, int(bin_height), default_backend("cpu"))
+    rows, loads, labels, count, filled = table
+    bins = Bins(
+        heights, empty, rows, loads, labels, count, filled, int(bin_height), default_backend("cpu")
+    )
     oriented = OrientedItem(
         torch.from_numpy(np.array([[sides]], np.int16)), (offset,) if any(offset) else None,
         item_weight,
@@ -99,13 +102,12 @@ def _check_item(item: ArrayLike) -> list[int]:
     Raises:
         ValueError: unless they are three whole numbers of cells ≥ 1.
     """
-    if type(item) in (tuple, list) and all(type(side) is int for side in item):  # the usual case
-        sides = list(item)
-    else:
+    sides: Any = item
+    if not isinstance(item, tuple | list) or any(type(side) is not int for side in item):
         sides = whole_cells("item", item).tolist()
-    if not (isinstance(sides, list) and len(sides) == 3 and min(sides) >= 1):
+    if not (isinstance(sides, tuple | list) and len(sides) == 3 and min(sides) >= 1):
         raise ValueError(f"item {item!r}: needs three whole sides w, d, h ≥ 1 in cells")
-    return sides
+    return list(sides)
 
 
 def _check_maps(heightmap: ArrayLike, empty_map: ArrayLike, bin_height: int) -> NDArray[np.int16]:
