@@ -5,6 +5,7 @@
    The masks are checked against the reading of marl_pack, with a square for each cell.
 2. Batched masks at 10 × 10, on every device.
 3. The cost for several sizes of the grid.
+4. One mask from NumPy arrays by :func:`marl_pack.stable_mask`, its checks included.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from marl_pack.stability import (
     hull_compiled,
     make_rule,
     orient_item,
+    stable_mask,
 )
 from marl_pack.stability.paper import convex_hull_alpha
 
@@ -92,14 +94,28 @@ def scaling(measured: Measurements) -> None:
         measured.keep(f"grid: {side} × {side}", us=1e6 * each, ns_cell=1e9 * each / side**2)
 
 
+def from_arrays(measured: Measurements, states: int = 16) -> None:
+    """Measure figure 4: one mask from NumPy arrays."""
+    for place in (SMALL, LARGE):
+        (width, depth, height), sides = place
+        game, items = in_play(states, place, steps=12), random_items(states, sides).tolist()
+        maps = [values.numpy().astype(int) for values in (game.bins.heightmap, game.bins.empty_map)]
+        seconds = 0.0
+        for b in range(states):
+            inputs = (maps[0][b], maps[1][b], items[b], height)
+            seconds += best_time(lambda i=inputs: stable_mask("hull_alpha", *i))  # type: ignore[misc]  # bound now
+        measured.keep(f"stable_mask: {width} × {depth}", us=1e6 * seconds / states)
+
+
 def main() -> None:
-    """Measure all three figures of this benchmark."""
+    """Measure all figures of this benchmark."""
     measured = Measurements("masks", __doc__, seed=1)
     measured.parse()
     torch.set_num_threads(1)
     against_the_literal_reading(measured)
     batched(measured)
     scaling(measured)
+    from_arrays(measured)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,12 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.candidates import Candidates
 from marl_pack.agents.keys import KEYS, ORIENTATION_AGENTS, POLICIES, Keys
 from marl_pack.agents.policy import (
-    InTurns,
     OrientationAgent,
     Placement,
     PlacementAgent,
     Policy,
     draw,
+    draw_placement,
 )
 from marl_pack.checks import LARGEST_SEED, shown, whole_number
 from marl_pack.game.moves import Moves
@@ -75,10 +75,7 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     if name in HEURISTICS:
         return HEURISTICS[name]
     generator = _generator(seed, device)
-    return InTurns(
-        lambda game: draw(game.orientation_mask, generator),
-        lambda game, orientation: draw(game.mask, generator, orientation),
-    )
+    return lambda game: draw_placement(game, generator)
 
 
 def make_orientation_agent(

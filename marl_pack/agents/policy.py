@@ -66,6 +66,35 @@ def draw(
     return code(mask, point, row)
 
 
+def draw_placement(game: Packing, generator: torch.Generator | None = None) -> Placement:
+    """Draw one of the orientations that may be chosen, then one of its legal cells, uniformly.
+
+    Args:
+        game: the games.
+        generator: as for :func:`draw`.
+
+    Returns:
+        Orientation and cell, int64 [G] each.
+    """
+    device = game.mask.device
+    points = torch.rand(2, game.n, 1, generator=generator, device=device)
+    code = default_backend(device).pick(compiled=_draw_pair_compiled, tensor=_draw_pair_tensor)
+    return code(game.orientation_mask, game.mask, points)
+
+
+def _draw_pair_compiled(orientations: Tensor, mask: Tensor, points: Tensor) -> Placement:
+    games, count = orientations.shape
+    point, drawn = points.numpy(), np.zeros((2, games), np.int64)
+    _draw_each(orientations.numpy().reshape(games, 1, count), point[0], drawn[0], drawn[0])
+    _draw_each(mask.numpy().reshape(games, count, -1), point[1], drawn[0], drawn[1])
+    return torch.from_numpy(drawn[0]), torch.from_numpy(drawn[1])
+
+
+def _draw_pair_tensor(orientations: Tensor, mask: Tensor, points: Tensor) -> Placement:
+    orientation = _draw_tensor(orientations, points[0], None)
+    return orientation, _draw_tensor(mask, points[1], orientation)
+
+
 def _draw_compiled(mask: Tensor, point: Tensor, row: Tensor | None) -> Tensor:
     """Return the entries at ``point``, float32 [G, 1], of the true entries, by compiled loops."""
     games, rows = mask.shape[0], 1 if row is None else mask.shape[1]

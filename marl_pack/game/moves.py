@@ -155,7 +155,8 @@ class LegalMoves:
     def __init__(self, spec: GameSpec, device: torch.device, backend: Backend) -> None:
         self.spec, self.rule, self.backend = spec, spec.make_rule(), backend
         allowed = torch.tensor([o in spec.orientations for o in ALL_ORIENTATIONS])
-        self._allowed = allowed.to(device)  # [6]
+        # bool [6], the allowed orientations, as the code of the backend needs them
+        self._allowed: Any = backend.pick(compiled=allowed.numpy(), tensor=allowed.to(device))
         self._offsets = rotated_offsets(spec.com_offset)
 
     def orient(self, items: Items) -> OrientedItem:
@@ -207,12 +208,12 @@ def _own_orientations(items: Items) -> NDArray[np.bool_]:
     return NO_SETS if items.orientations is None else items.orientations.numpy()
 
 
-def _orient_compiled(items: Items, allowed: Tensor) -> Tensor:
+def _orient_compiled(items: Items, allowed: NDArray[np.bool_]) -> Tensor:
     """Return items' sides [G, 6, 3] in six orientations; zeros where one is not allowed."""
     sides = items.sides.numpy()
-    oriented = np.empty((len(sides), len(ORIENTATIONS), 3), np.int16)
-    compiled.orient_items(sides, allowed.numpy(), _own_orientations(items), oriented)
-    return torch.from_numpy(oriented)
+    oriented_sides = np.empty((len(sides), len(ORIENTATIONS), 3), np.int16)
+    compiled.orient_items(sides, allowed, _own_orientations(items), oriented_sides)
+    return torch.from_numpy(oriented_sides)
 
 
 def _orient_tensor(items: Items, allowed: Tensor) -> Tensor:
@@ -221,12 +222,12 @@ def _orient_tensor(items: Items, allowed: Tensor) -> Tensor:
 
 
 def _choices_compiled(
-    moves: Moves, items: Items, allowed: Tensor, masked: bool
+    moves: Moves, items: Items, allowed: NDArray[np.bool_], masked: bool
 ) -> tuple[Tensor, Tensor]:
     """Return the orientations that may be chosen, bool [G, 6], and whether games go on [G]."""
     masks = moves.array
     possible, alive = np.empty(masks.shape[:2], np.bool_), np.empty(masks.shape[0], np.bool_)
-    compiled.find_choices(masks, allowed.numpy(), _own_orientations(items), masked, possible, alive)
+    compiled.find_choices(masks, allowed, _own_orientations(items), masked, possible, alive)
     return torch.from_numpy(possible), torch.from_numpy(alive)
 
 
