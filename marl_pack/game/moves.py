@@ -208,7 +208,7 @@ def _own_orientations(items: Items) -> NDArray[np.bool_]:
     return NO_SETS if items.orientations is None else items.orientations.numpy()
 
 
-def _orient_compiled(items: Items, allowed: NDArray[np.bool_]) -> Tensor:
+def _orient_compiled(items: Items, allowed: Any) -> Tensor:
     """Return items' sides [G, 6, 3] in six orientations; zeros where one is not allowed."""
     sides = items.sides.numpy()
     oriented_sides = np.empty((len(sides), len(ORIENTATIONS), 3), np.int16)
@@ -216,13 +216,13 @@ def _orient_compiled(items: Items, allowed: NDArray[np.bool_]) -> Tensor:
     return torch.from_numpy(oriented_sides)
 
 
-def _orient_tensor(items: Items, allowed: Tensor) -> Tensor:
+def _orient_tensor(items: Items, allowed: Any) -> Tensor:
     possible = allowed if items.orientations is None else allowed & items.orientations
     return oriented(items.sides) * possible[..., None]
 
 
 def _choices_compiled(
-    moves: Moves, items: Items, allowed: NDArray[np.bool_], masked: bool
+    moves: Moves, items: Items, allowed: Any, masked: bool
 ) -> tuple[Tensor, Tensor]:
     """Return the orientations that may be chosen, bool [G, 6], and whether games go on [G]."""
     masks = moves.array
@@ -232,7 +232,7 @@ def _choices_compiled(
 
 
 def _choices_tensor(
-    moves: Moves, items: Items, allowed: Tensor, masked: bool
+    moves: Moves, items: Items, allowed: Any, masked: bool
 ) -> tuple[Tensor, Tensor]:
     possible = moves.orientations
     alive = possible.any(1)
