@@ -61,6 +61,7 @@ RANGES = {
         for agent in ("orientation", "placement")
         for key in ("entropy_coef", "final_entropy_coef")
     },
+    **{f"{agent}.teacher_random": SHARE for agent in ("orientation", "placement")},
     **{f"{agent}.learning_rate": Range(0, FASTEST) for agent in ("orientation", "placement")},
 }
 """The range of each setting; the records of the game and of networks check their own fields."""

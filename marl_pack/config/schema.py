@@ -49,6 +49,7 @@ class Agent:
         teacher: the policy whose choices the agent clones at first, named like policy; null for
             none.
         teacher_iterations: number of iterations in which it clones the teacher.
+        teacher_random: share of the teacher's choices that are random instead, 0 to 1.
         learning_rate: the agent's own learning rate; null for ppo.learning_rate.
         entropy_coef: the agent's own entropy bonus; null for ppo.entropy_coef.
         final_entropy_coef: the agent's own entropy bonus at the end; null for
@@ -60,6 +61,7 @@ class Agent:
     network: Network = field(default_factory=Network)
     teacher: str | None = None
     teacher_iterations: int = 0
+    teacher_random: float = 0.1
     learning_rate: float | None = None
     entropy_coef: float | None = None
     final_entropy_coef: float | None = None

@@ -132,6 +132,7 @@ def runner_settings(
             "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
             "teacher": teachers.get(name),
             "teacher_iterations": agent.teacher_iterations,
+            "teacher_random": agent.teacher_random,
             "schedule": {
                 "schedule": schedule, "learning_rate": rate, "entropy_coef": entropy,
                 "final_entropy_coef": entropy if last is None else last,

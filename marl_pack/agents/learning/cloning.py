@@ -12,8 +12,6 @@ from marl_pack.agents.networks.kinds import AgentKind
 from marl_pack.agents.policy import draw
 from marl_pack.game.packing import Packing
 
-RANDOM_SHARE = 0.1  # share of a teacher's choices that are random, so that learners explore
-
 
 @dataclass(frozen=True)
 class Teacher:
@@ -23,16 +21,18 @@ class Teacher:
         kind: the kind of teacher and learner.
         agent: the teacher: games and earlier choices of the turn → actions int64 [G].
         iterations: number of iterations in which the learner clones it.
+        random_share: share of its choices that are random instead, so that the learner explores.
     """
 
     kind: AgentKind
     agent: Callable[..., Tensor]
     iterations: int
+    random_share: float
 
     def __call__(self, game: Packing, *before: Tensor) -> Tensor:
-        """Return the teacher's actions, int64 [G], a tenth of them replaced by random ones."""
+        """Return the teacher's actions, int64 [G], some of them replaced by random ones."""
         actions = self.agent(game, *before)
-        replaced = torch.rand(len(actions), device=actions.device) < RANDOM_SHARE
+        replaced = torch.rand(len(actions), device=actions.device) < self.random_share
         return torch.where(replaced, self._random(game, *before), actions)
 
     def _random(self, game: Packing, *before: Tensor) -> Tensor:

@@ -314,8 +314,8 @@ class PackingPPO:
             env: the games.
             cfg: the configuration. ``algorithm`` has ``iterations``, ``lookahead``, ``frozen`` and
                 ``teachers`` (both: agents by name, callables as in :class:`Seat`). ``agents`` has
-                for each learner ``network``, ``algorithm`` (settings of rsl_rl's PPO), ``schedule``
-                and ``teacher_iterations``.
+                for each learner ``network``, ``algorithm`` (settings of rsl_rl's PPO),
+                ``schedule``, ``teacher_iterations`` and ``teacher_random``.
             device: the device of the networks.
         """
         algorithm = cfg["algorithm"]
@@ -334,7 +334,8 @@ class PackingPPO:
             example = TensorDict(example, batch_size=[env.num_envs], device=env.device)
             teacher = None
             if name in teachers:
-                teacher = Teacher(kind, teachers[name], settings["teacher_iterations"])
+                length, share = settings["teacher_iterations"], settings["teacher_random"]
+                teacher = Teacher(kind, teachers[name], length, share)
             seats.append(
                 Seat(
                     kind, _stock_ppo(name, settings, example, env, cfg, device), planes=planes,
