@@ -67,37 +67,68 @@ def place_boxes(
     return resting_height, gap.flatten(1).sum(1)
 
 
-def shift(values: Tensor, steps: Tensor, dim: int) -> Tensor:
-    """Shift maps [B, W, D]: each entry becomes the entry ``steps`` [B] further along ``dim``.
-
-    Past the edge, the last entry is repeated.
-    """
-    length = values.shape[dim]
-    index = torch.arange(length, device=values.device) + steps[:, None]
-    index = index.clamp(0, length - 1)
-    index = index[:, :, None] if dim == 1 else index[:, None, :]
-    return values.gather(dim, index.expand_as(values))
+def bins_last(maps: Tensor) -> Tensor:
+    """Return maps [N, W, D] as [W, D, 1, N], so that every operation runs along many bins."""
+    return maps.permute(1, 2, 0).contiguous()[:, :, None]
 
 
-def slide(values: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Compute the maximum over the w × d window with its low corner at each cell, by doubling.
+def _bit_masks(numbers: Tensor, most: int, dtype: torch.dtype) -> Tensor:
+    """Return for each bit of numbers [A, N] up to ``most`` all ones where it is set, else 0."""
+    bits = torch.arange(most.bit_length(), device=numbers.device)[:, None, None]
+    return (numbers >> bits & 1).to(dtype).neg()
+
+
+def _replace(values: Tensor, which: Tensor, new: Tensor) -> None:
+    """Write ``new`` into ``values`` where the mask has all ones; faster than ``where``."""
+    values ^= (new ^ values) & which
+
+
+def shift(values: Tensor, steps: Tensor, dim: int, most: int) -> Tensor:
+    """Shift maps: each entry becomes the entry ``steps`` further along ``dim``.
 
     Args:
-        values: [B, W, D].
-        w: int64 [B], the windows' cells along x, ≥ 1.
-        d: int64 [B], the windows' cells along y, ≥ 1.
+        values: whole numbers [..., A, N].
+        steps: int64 [A, N].
+        dim: the dimension.
+        most: no map is shifted by more steps than this.
 
     Returns:
-        [B, W, D]; correct wherever the window lies inside the map.
+        The maps; entries that would come from past the edge have no meaning.
     """
-    for extent, dim in ((d, 2), (w, 1)):
-        longest = int(extent.max()) if extent.numel() else 0
-        reach = 1
-        while reach < longest:
-            step = torch.clamp(extent - reach, min=0, max=reach)
-            values = torch.maximum(values, shift(values, step, dim))
-            reach *= 2
+    values = values.clone()
+    for bit, which in enumerate(_bit_masks(steps, most, values.dtype)):
+        length = values.shape[dim] - (1 << bit)
+        if length > 0:
+            _replace(values.narrow(dim, 0, length), which, values.narrow(dim, 1 << bit, length))
     return values
+
+
+def slide(values: Tensor, extents: Tensor, dim: int, most: int) -> Tensor:
+    """Compute the maximum over the window along ``dim`` that begins at each entry.
+
+    A window is cut into parts whose lengths are different powers of two.
+
+    Args:
+        values: whole numbers ≥ 0 [..., A or 1, N].
+        extents: int64 [A, N], the windows' lengths, ≥ 1.
+        dim: the dimension.
+        most: no window is longer than this.
+
+    Returns:
+        [..., A, N]; correct wherever the window lies inside the map.
+    """
+    length, shape = values.shape[dim], [*values.shape[:-2], *extents.shape]
+    shape[dim] += 1  # windows that begin past the edge are empty
+    largest = values.new_zeros(shape)
+    for bit, which in enumerate(_bit_masks(extents, min(most, length), values.dtype)):
+        reach = 1 << bit
+        if bit:
+            rest, half = values.shape[dim] - reach // 2, reach // 2
+            values = torch.maximum(values.narrow(dim, 0, rest), values.narrow(dim, half, rest))
+        rest = values.shape[dim]
+        longer = torch.maximum(values, largest.narrow(dim, reach, rest))
+        _replace(largest.narrow(dim, 0, rest), which, longer)
+    return largest.narrow(dim, 0, length)
 
 
 def windows_inside(sides: Tensor, width: int, depth: int) -> Tensor:
@@ -122,10 +153,9 @@ def resting_heights(heightmap: Tensor, sides: Tensor) -> Tensor:
     Returns:
         int16 [N, A, W, D]; correct wherever the window lies inside the map.
     """
-    count = sides.shape[1]
-    flat = sides.flatten(0, 1).long().clamp(min=1)
-    highest = slide(heightmap.repeat_interleave(count, 0), flat[:, 0], flat[:, 1])
-    return highest.view(-1, count, *highest.shape[1:])
+    w, d, _ = sides.permute(2, 1, 0).contiguous().long().clamp(min=1)
+    rows = slide(bins_last(heightmap), d, 1, heightmap.shape[2])
+    return slide(rows, w, 0, heightmap.shape[1]).permute(3, 2, 0, 1).contiguous()
 
 
 def window_sum(values: Tensor, w: Tensor, d: Tensor) -> Tensor:
