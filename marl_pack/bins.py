@@ -198,6 +198,8 @@ def place(
     com: Tensor | None = None,
     labels: tuple[Tensor, Tensor] | None = None,
     unit: float = 1.0,
+    *,
+    check: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin from above and update the bins (Algorithm 2 for the empty map).
 
@@ -214,6 +216,8 @@ def place(
         labels: ids and orientations of the boxes' items, int64 [N] each; unknown (-1) by default.
         unit: number of units in a cell. If ``com`` contains whole numbers, each stored centre is
             rounded only once, so it is the float64 that is nearest to the exact centre.
+        check: whether tensor code checks that the boxes fit; the program waits for this check.
+            In compiled code the check costs nothing and is always made.
 
     Returns:
         Resting heights int16 [N], wasted cells int64 [N] (empty cells enclosed below the box) and
@@ -223,6 +227,8 @@ def place(
         ValueError: if a bin is full, or a box reaches out of the map. The bins have not changed
             then.
     """
+    if check and bins.backend is Backend.TENSOR:
+        _check_boxes(bins, sides, corners)
     code = bins.backend.pick(compiled=_place_compiled, tensor=_place_tensor)
     return code(bins, sides, corners, weights, com, labels, unit)
 
@@ -346,6 +352,15 @@ def _place_compiled(
 # --- tensor code ----------------------------------------------------------------------------------
 
 
+def _check_boxes(bins: Bins, sides: Tensor, corners: Tensor) -> None:
+    """Raise ValueError if a bin is full, or a box reaches out of the map."""
+    real, far = (sides > 0).all(1), corners + sides[:, :2]
+    outside = (corners < 0).any(1) | (far[:, 0] > bins.size[0]) | (far[:, 1] > bins.size[1])
+    full = bins.count >= bins.boxes.shape[1]
+    if bool((real & (full | outside)).any()):
+        refuse(bins, full=bool((real & full).any()))
+
+
 def _place_tensor(
     bins: Bins,
     sides: Tensor,
@@ -358,11 +373,6 @@ def _place_tensor(
     """Place one box in each bin in tensor code; the arguments are those of :func:`place`."""
     volume = sides.long().prod(1)
     real = volume > 0
-    far = corners + sides[:, :2]
-    outside = (corners < 0).any(1) | (far[:, 0] > bins.size[0]) | (far[:, 1] > bins.size[1])
-    full = bins.count >= bins.boxes.shape[1]
-    if bool((real & (full | outside)).any()):
-        refuse(bins, full=bool((real & full).any()))
     sides = torch.where(real[:, None], sides, 0)
     under = footprint(*bins.size[:2], sides, corners)
     resting_height, waste = place_boxes(bins.heightmap, bins.empty_map, under, sides[:, 2])

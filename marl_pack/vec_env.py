@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 from rsl_rl.env import VecEnv
@@ -11,6 +12,36 @@ from torch import Tensor
 
 from marl_pack.game.packing import Packing
 from marl_pack.game.state import Copied
+from marl_pack.game.turns import Outcome
+
+
+class EndedEpisodes(Mapping[str, Tensor]):
+    """The figures of the episodes that ended in a step; without such episodes it is empty.
+
+    They are selected when the logger reads them, so that no step waits for their number.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        self._outcome = outcome
+
+    @cached_property
+    def _figures(self) -> dict[str, Tensor]:
+        ended = self._outcome.done.nonzero().squeeze(1)
+        if not len(ended):
+            return {}
+        return {
+            "Train/utilization": self._outcome.utilization[ended].float(),
+            "Train/items": self._outcome.placed[ended].float(),
+        }
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._figures[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._figures)
+
+    def __len__(self) -> int:
+        return len(self._figures)
 
 
 class PackingVecEnv(Copied, VecEnv):
@@ -65,7 +96,8 @@ class PackingVecEnv(Copied, VecEnv):
 
         Returns:
             The next observation, rewards float32 [G] (Eq. 5), dones uint8 [G] and extras: ``log``
-            has the utilization and number of items of the episodes that have ended.
+            has the utilization and number of items of the episodes that have ended
+            (:class:`EndedEpisodes`).
 
         Raises:
             ValueError: unless the actions are int64 [G, 2].
@@ -74,11 +106,5 @@ class PackingVecEnv(Copied, VecEnv):
             shape = [self.num_envs, self.num_actions]
             raise ValueError(f"actions {list(actions.shape)}: need int64 {shape}")
         outcome = self.game.place(actions[:, 0], actions[:, 1], check=False)
-        ended = outcome.done.nonzero().squeeze(1)
-        log = {}
-        if len(ended):
-            log = {
-                "Train/utilization": outcome.utilization[ended].float(),
-                "Train/items": outcome.placed[ended].float(),
-            }
-        return self.get_observations(), outcome.reward, outcome.done.byte(), {"log": log}
+        extras = {"log": EndedEpisodes(outcome)}
+        return self.get_observations(), outcome.reward, outcome.done.byte(), extras

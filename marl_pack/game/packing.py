@@ -127,6 +127,7 @@ class Packing(Copied):
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
         self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
+        self._all_fit = self.backend is Backend.TENSOR and self._every_item_fits()
         self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.reset(first_episode=first_episode)
 
@@ -506,7 +507,7 @@ class Packing(Copied):
         corners = torch.stack(self.floor.corner(cell), 1)
         labels = self.items.ids_at(state.t), orientation
         _, waste, volume = bin_state.place(
-            state.bins, sides, corners, self.items.weights, com, labels, unit
+            state.bins, sides, corners, self.items.weights, com, labels, unit, check=check
         )
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * volume.double() - self._loss * waste.double()).float()
@@ -549,6 +550,9 @@ class Packing(Copied):
         Raises:
             ValueError: if :data:`MOST_SKIPPED` episodes in a row have no such item.
         """
+        if self._all_fit:  # so the device need not be asked whether an episode is skipped
+            self._begin_by_mask(~self.alive)
+            return
         begin = self.backend.pick(compiled=self._begin_some, tensor=self._begin_by_mask)
         for _ in range(MOST_SKIPPED):
             if not bool(ended.any()):
@@ -561,6 +565,19 @@ class Packing(Copied):
             f"bin {self.size}; check the allowed orientations {self.spec.orientations}, the rule's "
             "margin and com_offset"
         )
+
+    def _every_item_fits(self) -> bool:
+        """Return whether every item of the stream surely has a legal cell in an empty bin.
+
+        In an orientation in which the longest cube fits, every item fits. If the shortest cube is
+        stable on the floor in an orientation, every larger footprint is.
+        """
+        shortest, longest = self.stream.sides
+        sides = torch.tensor([[shortest] * 3, [longest] * 3], dtype=torch.int16, device=self.device)
+        bins = bin_state.empty(2, self.size, 0, self.device, self.backend)
+        items = Items(sides, sides.double().prod(1))
+        both = self.legal.moves(bins, items).orientations.all(0).tolist()
+        return all(any(both[o] for o in some) for some in self.orientation_sets)
 
     def _begin_some(self, ended: Tensor) -> None:
         """Begin the next episode where ``ended``, computing nothing for the other games."""

@@ -6,6 +6,7 @@ each map can have a window of another size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -72,9 +73,9 @@ def bins_last(maps: Tensor) -> Tensor:
     return maps.permute(1, 2, 0).contiguous()[:, :, None]
 
 
-def _bit_masks(numbers: Tensor, most: int, dtype: torch.dtype) -> Tensor:
-    """Return for each bit of numbers [A, N] up to ``most`` all ones where it is set, else 0."""
-    bits = torch.arange(most.bit_length(), device=numbers.device)[:, None, None]
+def _bit_masks(numbers: Tensor, count: int, dtype: torch.dtype) -> Tensor:
+    """Return for each of the lowest bits of numbers [A, N] all ones where it is set, else 0."""
+    bits = torch.arange(count, device=numbers.device)[:, None, None]
     return (numbers >> bits & 1).to(dtype).neg()
 
 
@@ -87,7 +88,7 @@ def shift(values: Tensor, steps: Tensor, dim: int, most: int) -> Tensor:
     """Shift maps: each entry becomes the entry ``steps`` further along ``dim``.
 
     Args:
-        values: whole numbers [..., A, N].
+        values: whole numbers [..., A or 1, N].
         steps: int64 [A, N].
         dim: the dimension.
         most: no map is shifted by more steps than this.
@@ -95,8 +96,8 @@ def shift(values: Tensor, steps: Tensor, dim: int, most: int) -> Tensor:
     Returns:
         The maps; entries that would come from past the edge have no meaning.
     """
-    values = values.clone()
-    for bit, which in enumerate(_bit_masks(steps, most, values.dtype)):
+    values = values.expand(*values.shape[:-2], *steps.shape).clone()
+    for bit, which in enumerate(_bit_masks(steps, most.bit_length(), values.dtype)):
         length = values.shape[dim] - (1 << bit)
         if length > 0:
             _replace(values.narrow(dim, 0, length), which, values.narrow(dim, 1 << bit, length))
@@ -106,29 +107,62 @@ def shift(values: Tensor, steps: Tensor, dim: int, most: int) -> Tensor:
 def slide(values: Tensor, extents: Tensor, dim: int, most: int) -> Tensor:
     """Compute the maximum over the window along ``dim`` that begins at each entry.
 
+    The arguments are those of :func:`slide_all`, with one map.
+    """
+    return slide_all(lambda a, b: [torch.maximum(a[0], b[0])], [values], extents, dim, most)[0]
+
+
+def slide_counts(
+    values: Tensor, counts: Tensor, extents: Tensor, dim: int, most: int
+) -> list[Tensor]:
+    """Compute the maximum over each window, and the sum of the counts of the entries that reach it.
+
+    The arguments are those of :func:`slide_all`, with two maps.
+    """
+
+    def join(one: list[Tensor], other: list[Tensor]) -> list[Tensor]:
+        largest = torch.maximum(one[0], other[0])
+        count = one[1] * (one[0] == largest)
+        return [largest, count.addcmul_(other[1], (other[0] == largest).to(count.dtype))]
+
+    return slide_all(join, [values, counts], extents, dim, most)
+
+
+def slide_all(
+    join: Callable[[list[Tensor], list[Tensor]], list[Tensor]],
+    maps: list[Tensor],
+    extents: Tensor,
+    dim: int,
+    most: int,
+) -> list[Tensor]:
+    """Join the entries of the window along ``dim`` that begins at each entry.
+
     A window is cut into parts whose lengths are different powers of two.
 
     Args:
-        values: whole numbers ≥ 0 [..., A or 1, N].
+        join: joins the results of two parts; zeros are the result of an empty part.
+        maps: whole numbers ≥ 0 [..., A or 1, N] each.
         extents: int64 [A, N], the windows' lengths, ≥ 1.
         dim: the dimension.
         most: no window is longer than this.
 
     Returns:
-        [..., A, N]; correct wherever the window lies inside the map.
+        [..., A, N] each; correct wherever the window lies inside the map.
     """
-    length, shape = values.shape[dim], [*values.shape[:-2], *extents.shape]
+    length, shape = maps[0].shape[dim], [*maps[0].shape[:-2], *extents.shape]
     shape[dim] += 1  # windows that begin past the edge are empty
-    largest = values.new_zeros(shape)
-    for bit, which in enumerate(_bit_masks(extents, min(most, length), values.dtype)):
-        reach = 1 << bit
+    joined = [values.new_zeros(shape) for values in maps]
+    bits = min(most, length).bit_length()
+    masks = [_bit_masks(extents, bits, values.dtype) for values in maps]
+    for bit in range(bits):
+        rest = length + 1 - (1 << bit)
         if bit:
-            rest, half = values.shape[dim] - reach // 2, reach // 2
-            values = torch.maximum(values.narrow(dim, 0, rest), values.narrow(dim, half, rest))
-        rest = values.shape[dim]
-        longer = torch.maximum(values, largest.narrow(dim, reach, rest))
-        _replace(largest.narrow(dim, 0, rest), which, longer)
-    return largest.narrow(dim, 0, length)
+            half = 1 << bit >> 1
+            maps = join(*([m.narrow(dim, at, rest) for m in maps] for at in (0, half)))
+        longer = join(maps, [values.narrow(dim, 1 << bit, rest) for values in joined])
+        for values, which, new in zip(joined, masks, longer, strict=True):
+            _replace(values.narrow(dim, 0, rest), which[bit], new)
+    return [values.narrow(dim, 0, length) for values in joined]
 
 
 def windows_inside(sides: Tensor, width: int, depth: int) -> Tensor:
@@ -195,7 +229,7 @@ def wasted_cells(heightmap: Tensor, sides: Tensor, resting_heights: Tensor) -> T
 
 
 def cut_windows(
-    values: Tensor, index: Tensor, x: Tensor, y: Tensor, sides: Tensor
+    values: Tensor, index: Tensor, x: Tensor, y: Tensor, sides: Tensor, most: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Cut windows of different sizes out of maps.
 
@@ -205,12 +239,12 @@ def cut_windows(
         x: int64 [U], each window's low corner along W.
         y: int64 [U], each window's low corner along D.
         sides: int [U, ≥ 2], each window's sides w, d.
+        most: the largest w and d.
 
     Returns:
         [U, w, d] for the largest w and d, and bool [U, w, d]: which cells belong to the window.
     """
-    i = torch.arange(int(sides[:, 0].max()), device=values.device)
-    j = torch.arange(int(sides[:, 1].max()), device=values.device)
+    i, j = (torch.arange(cells, device=values.device) for cells in most)
     rows = (x[:, None] + i).clamp(max=values.shape[1] - 1)
     columns = (y[:, None] + j).clamp(max=values.shape[2] - 1)
     member = (i < sides[:, :1])[:, :, None] & (j < sides[:, 1:2])[:, None, :]

@@ -30,7 +30,9 @@ def mix(key: Tensor, counter: Tensor | int) -> Tensor:
 
     This is the output function of SplitMix64 (Steele et al. 2014).
     """
-    z = key + (torch.as_tensor(counter, device=key.device) + 1) * _signed(GOLDEN)
+    if not isinstance(counter, Tensor):
+        counter = torch.full_like(key, counter)
+    z = key + (counter + 1) * _signed(GOLDEN)
     z = (z ^ _shift_right(z, 30)) * _signed(_MIX_1)
     z = (z ^ _shift_right(z, 27)) * _signed(_MIX_2)
     return z ^ _shift_right(z, 31)

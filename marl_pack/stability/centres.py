@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -65,12 +65,19 @@ class CentreTable:
 
     def units(self, sides: Tensor) -> Tensor:
         """Return the centres in units, float64 [N, A, 2], of items with ``sides`` [N, A, 3]."""
-        return self.look_up(self.at, sides)
+        return self.look_up("at", sides)
 
-    @staticmethod
-    def look_up(table: NDArray[np.generic], sides: Tensor) -> Tensor:
+    @cached_property
+    def _copies(self) -> dict[tuple[str, torch.device], Tensor]:
+        """The tables as tensors, by name and device; a copy to a GPU would wait in every step."""
+        return {}
+
+    def look_up(self, name: str, sides: Tensor) -> Tensor:
         """Return the entries of a table [A, 2, L + 1] for the sides w, d of ``sides`` [N, A, 3]."""
-        entries = torch.from_numpy(table).to(sides.device)
+        key = name, sides.device
+        if key not in self._copies:
+            self._copies[key] = torch.from_numpy(getattr(self, name)).to(sides.device)
+        entries = self._copies[key]
         index = sides[..., :2].long().clamp(max=entries.shape[2] - 1)
         return entries.expand(len(sides), -1, -1, -1).gather(3, index[..., None]).squeeze(3)
 

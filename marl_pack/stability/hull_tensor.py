@@ -9,6 +9,8 @@ the program waits for their number. The masks are equal cell by cell.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -141,8 +143,43 @@ def inside(contact: Tensor, com: Tensor, centres: CentreTable) -> tuple[Tensor, 
     return sure, possible
 
 
-def _float_of(centres: CentreTable, size: tuple[int, int, int]) -> torch.dtype | None:
-    """Return the type of the numbers in :func:`_surrounded`, None if it cannot be used.
+@dataclass(frozen=True)
+class _Windows:
+    """The footprints of A oriented items of N bins, and their parts around the centre of mass."""
+
+    sides: Tensor  # int64 [2, A, N]     w, d, clamped to the map
+    low: Tensor  # int64 [2, A, N]       cells of the parts that begin at the low corner
+    start: Tensor  # int64 [2, A, N]     first cells of the parts that end at the high corner
+    middle: Tensor  # float64 [2, A, N]  the centre of mass in units, from the low corner
+    centres: CentreTable
+    central: bool  # centres of mass in the middle and no margin
+    x_fits: Tensor  # bool [W, 1, A, N]  where the box lies inside the bin along x, and has cells
+    # with its height beyond the margin on each side
+    y_fits: Tensor  # bool [D, A, N]     where it lies inside the bin along y
+
+
+def _windows(sides: Tensor, size: tuple[int, int, int], centres: CentreTable | None) -> _Windows:
+    """Return the footprints of oriented items, ``sides`` [N, A, 3], in a bin of ``size``."""
+    width, depth, height = size
+    w, d, h = boxes = sides.permute(2, 1, 0).contiguous().long()  # [A, N] each
+    central = centres is None
+    if centres is None:
+        centres, low, start = CENTRAL, (boxes[:2] + 1) // 2, boxes[:2] // 2
+        middle = boxes[:2].double()
+    else:
+        low, start, middle = (
+            centres.look_up(table, sides).permute(2, 1, 0).contiguous()
+            for table in ("low", "start", "at")
+        )
+    fits = (h > 0) & (h <= height) & ((low > 0) & (start < boxes[:2])).all(0)
+    x, y = (torch.arange(side, device=w.device)[:, None, None] for side in (width, depth))
+    clamped = torch.stack((w.clamp(1, width), d.clamp(1, depth)))
+    x_fits = (fits & (x <= width - w))[:, None]
+    return _Windows(clamped, low, start, middle, centres, central, x_fits, y <= depth - d)
+
+
+def _number_type(centres: CentreTable, size: tuple[int, int, int]) -> torch.dtype | None:
+    """Return the type of the numbers in :func:`_surrounded`; None: it cannot be used.
 
     Two sums of rises differ by at least 1 / gap of their size. The type needs four bits more.
     """
@@ -159,57 +196,58 @@ def _gap(unit: float, width: int, depth: int) -> int:
     return int(unit) * (depth + 1) + int(unit) ** 2 * width * depth
 
 
-def _surrounded(
-    levels: Tensor,
-    best: Tensor,
-    extents: tuple[Tensor, Tensor],
-    centre: tuple[Tensor, Tensor],
-    height: int,
-    centres: CentreTable,
-    reach: int,
-) -> Tensor:
+def _surrounded(levels: Tensor, best: Tensor, windows: _Windows, height: int) -> Tensor:
     """Decide for all windows whether the centre of mass lies strictly inside the hull of contact.
 
     Seen from the centre of mass, the hull passes above it iff the steepest rise to a corner on the
     left and the steepest rise to a corner on the right add up to more than 0, or a corner lies
-    right above; the same holds below. A row of cells has its highest corners at its last cell of
+    right above; the same holds below. A row of cells has its outermost corners at its last cell of
     the largest level. If this level is not that of the window, the corners are so low that they do
     not count.
 
     Args:
         levels: [W, D, 1, N], K of every column.
         best: [W, D, A, N], the windows' largest K.
-        extents: int64 [A, N] each, the windows' sides w, d, inside the map.
-        centre: float64 [A, N] each, x and y of the centre of mass in units.
+        windows: the windows.
         height: H.
-        centres: the table with the unit.
-        reach: the largest number of corners on one side of a centre of mass, less the window's own.
 
     Returns:
         Bool [W, D, A, N]; it has a meaning for windows with contact in each half.
     """
-    width, depth = best.shape[:2]
-    (w, d), (cx, cy) = extents, centre
-    dtype, unit = _float_of(centres, (width, depth, height)), int(centres.unit)
+    width, depth, count, n = best.shape
+    at_once = CELLS_AT_ONCE if best.device.type == "cpu" else CELLS_AT_ONCE << 8
+    at_once = max(1, at_once // (width * depth * count))
+    unit = int(windows.centres.unit)
+    gap, dtype = _gap(unit, width, depth), _number_type(windows.centres, (width, depth, height))
     assert dtype is not None
-    gap, whole = _gap(unit, width, depth), torch.int32 if dtype == torch.float32 else torch.int64
-    y = unit * torch.arange(depth, device=w.device)
-    high = torch.stack((y + unit, unit * depth - y))[:, None, :, None, None]  # upwards, downwards
-    rows = slide(levels.to(whole) * gap + high.to(whole), d, 2, depth)
-    corners = torch.maximum(rows[:, :-1], rows[:, 1:])  # at x = 1 … W - 1
-    own = torch.stack((y[:, None, None] + cy, (unit * depth - y)[:, None, None] - cy))
-    own = best.to(dtype) * gap + own[:, None].to(dtype)
-    after = (cx / unit).floor().long() + 1  # first corner on the right
-    right_of = shift(corners, after - 1, 1, width - 1).to(dtype)
-    end = shift(rows, w - 1, 1, width - 1).to(dtype)
-    rows, corners = rows.to(dtype), corners.to(dtype)
-    x = torch.arange(reach + 1, device=w.device)[:, None, None]
-    left = _steepest(own, [rows, *(corners[:, i:] for i in range(reach))], cx - unit * x)
-    run = torch.where(after + x < w, unit * (after + x) - cx, -1)
-    run[-1] = w * unit - cx
-    right = _steepest(own, [*(right_of[:, i:] for i in range(reach)), end], run)
+    whole = torch.int32 if dtype == torch.float32 else torch.int64
     error = 2.0**-21 if dtype == torch.float32 else 2.0**-50
-    return (left + right > error * (left.abs() + right.abs())).all(0)
+    y = unit * torch.arange(depth, device=best.device)
+    high = torch.stack((y + unit, unit * depth - y))[:, None, :, None, None]  # upwards, downwards
+    own = torch.stack((y, unit * depth - y))[:, None, :, None, None]
+    reach = width // 2 if windows.central else width - 1  # corners that a side has beside its last
+    x = torch.arange(reach + 1, device=best.device)[:, None, None]
+    verdicts = []
+    for first in range(0, max(1, n), at_once):
+        part = slice(first, first + at_once)
+        (w, d), (cx, cy) = windows.sides[..., part], windows.middle[..., part]
+        rows = slide((levels[..., part].to(whole) * gap + high).to(whole), d, 2, depth)
+        corners = torch.maximum(rows[:, :-1], rows[:, 1:])  # at x = 1 … W - 1
+        begin = (cx / unit).floor().long()  # the row of the first corner on the right
+        right_of = shift(corners, begin, 1, width - 1).to(dtype)
+        last = shift(rows, w - 1, 1, width - 1).to(dtype)
+        rows, corners = rows.to(dtype), corners.to(dtype)
+        centre = torch.stack((cy, -cy))[:, None, None] + own
+        centre = best[..., part].to(dtype) * gap + centre.to(dtype)
+        run = cx - unit * x
+        left = _steepest(centre, [rows, *(corners[:, i:] for i in range(reach))], run)
+        run = torch.where(begin + 1 + x < w, unit * (begin + 1 + x) - cx, -1)
+        run[-1] = w * unit - cx
+        right = _steepest(centre, [*(right_of[:, i:] for i in range(reach)), last], run)
+        needed = right.neg_()
+        passes = left > needed.add(needed.abs(), alpha=error)
+        verdicts.append(passes[0] & passes[1])
+    return torch.cat(verdicts, 3)
 
 
 def _steepest(own: Tensor, points: list[Tensor], runs: Tensor) -> Tensor:
@@ -232,26 +270,35 @@ def _steepest(own: Tensor, points: list[Tensor], runs: Tensor) -> Tensor:
     return steepest
 
 
-def _parts(
-    values: Tensor, axis: int, extent: Tensor, low: Tensor, start: Tensor, equal: bool
-) -> tuple[Tensor, Tensor]:
+def _parts(values: Tensor, axis: int, windows: _Windows) -> tuple[Tensor, Tensor]:
     """Compute the largest K along an axis in the low part and in the high part of each window.
 
     Args:
-        values: [W, D, A or 1, N].
-        axis: 0 or 1.
-        extent: int64 [A, N], the windows' cells along the axis.
-        low: int64 [A, N], cells of the low part, which begins at the window's low corner.
-        start: int64 [A, N], first cell of the high part, which ends at the window's high corner.
-        equal: whether both parts have the same size: centre of mass in the middle and no margin.
+        values: [..., W, D, A or 1, N].
+        axis: 0 for x, 1 for y.
+        windows: the windows.
 
     Returns:
-        [W, D, A, N] each.
+        [..., W, D, A, N] each.
     """
-    length, low, high = values.shape[axis], low.clamp(min=1), (extent - start).clamp(min=1)
-    first = slide(values, low, axis, (length + 1) // 2 if equal else length)
-    last = first if equal else slide(values, high, axis, length)
-    return first, shift(last, extent - high, axis, length - 1)
+    dim = axis - 4
+    length, low = values.shape[dim], windows.low[axis].clamp(min=1)
+    high = (windows.sides[axis] - windows.start[axis]).clamp(min=1)
+    first = slide(values, low, dim, (length + 1) // 2 if windows.central else length)
+    last = first if windows.central else slide(values, high, dim, length)
+    return first, shift(last, windows.sides[axis] - high, dim, length - 1)
+
+
+def flat_mask(
+    heightmap: Tensor,
+    empty_map: Tensor,
+    sides: Tensor,
+    height: int,
+    centres: CentreTable | None = None,
+) -> tuple[Tensor, None]:
+    """Compute :func:`support_mask` in empty bins: contact is everywhere, so no map is read."""
+    windows = _windows(sides, (heightmap.shape[1], heightmap.shape[2], height), centres)
+    return _bins_first(windows.x_fits & windows.y_fits), None
 
 
 def support_mask(
@@ -276,65 +323,42 @@ def support_mask(
         fractions must decide; None if there are none.
     """
     assert height <= MAX_HEIGHT
-    n, width, depth = heightmap.shape
-    w, d, h = sides.permute(2, 1, 0).contiguous().long()  # [A, N] each
-    equal = centres is None
-    if centres is None:
-        centres, low, start = CENTRAL, ((w + 1) // 2, (d + 1) // 2), (w // 2, d // 2)
-        middle = torch.stack((w, d)).double()
-    else:
-        tables = centres.low, centres.start, centres.at
-        low, start, middle = (
-            centres.look_up(table, sides).permute(2, 1, 0).contiguous() for table in tables
-        )
-    within = (h > 0) & (h <= height)
-    for side, first, last in zip((w, d), low, start, strict=True):
-        within &= (first > 0) & (last < side)
-    within_x = within & (torch.arange(width, device=w.device)[:, None, None] <= width - w)
-    within_y = torch.arange(depth, device=w.device)[:, None, None] <= depth - d
-    w, d = w.clamp(1, width), d.clamp(1, depth)
+    width, depth = heightmap.shape[1:]
+    windows = _windows(sides, (width, depth, height), centres)
     kind = torch.uint8 if height <= 126 else torch.int16
     levels = bins_last((2 * heightmap + (empty_map == 0)).to(kind))  # [W, D, 1, N]
-    front, back = _parts(levels, 1, d, low[1], start[1], equal)
-    (a, c), (b, e) = (_parts(values, 0, w, low[0], start[0], equal) for values in (front, back))
-    if centres.margin == 0:  # the quadrants cover the window
+    front, back = _parts(levels, 1, windows)
+    (a, b), (c, e) = _parts(torch.stack((front, back)), 0, windows)  # low, high in x
+    if windows.centres.margin == 0:  # the quadrants cover the window
         halves = [torch.maximum(*pair) for pair in ((a, b), (c, e), (a, c), (b, e))]
         best = torch.maximum(halves[0], halves[1])
     else:
-        rows = slide(levels, d, 1, depth)
-        halves = [slide(values, w, 0, width) for values in (front, back)]
-        halves += _parts(rows, 0, w, low[0], start[0], equal)
-        best = slide(rows, w, 0, width)
-    possible = best <= (2 * (height - h) + 1).clamp(min=0).to(kind)
-    possible &= (best & 1).bool() & within_y
-    possible &= within_x[:, None]
+        rows = slide(levels, windows.sides[1], 1, depth)
+        halves = [slide(values, windows.sides[0], 0, width) for values in (front, back)]
+        halves += _parts(rows, 0, windows)
+        best = slide(rows, windows.sides[0], 0, width)
+    top = 2 * (height - sides[..., 2].T.long()) + 1
+    possible = best <= top.contiguous().clamp(min=0).to(kind)
+    possible &= (best & 1).bool() & windows.y_fits
+    possible &= windows.x_fits
     quadrants = torch.minimum(torch.minimum(a, b), torch.minimum(c, e)) == best
     for half in halves:
         possible &= half == best
-    if _float_of(centres, (width, depth, height)) is not None:
-        reach = width // 2 if equal else width - 1
-        at_once = CELLS_AT_ONCE if heightmap.device.type == "cpu" else CELLS_AT_ONCE << 8
-        at_once = max(1, at_once // (width * depth * len(w)))
-        verdict = torch.cat(
-            [
-                _surrounded(
-                    levels[..., part], best[..., part], (w[:, part], d[:, part]),
-                    (middle[0, :, part], middle[1, :, part]), height, centres, reach,
-                )
-                for part in (slice(i, i + at_once) for i in range(0, max(1, n), at_once))
-            ],
-            3,
-        )
+    if _number_type(windows.centres, (width, depth, height)) is not None:
+        verdict = _surrounded(levels, best, windows, height)
         return _bins_first(possible & (quadrants | verdict)), None
-    mask, undecided = _bins_first(possible & quadrants), _bins_first(possible & ~quadrants)
-    if not bool(undecided.any()):
+    mask = _bins_first(possible & quadrants)
+    undecided = (_bins_first(possible) & ~mask).nonzero()
+    if not len(undecided):
         return mask, None
-    b, a, x, y = rows = undecided.nonzero(as_tuple=True)
-    window, member = cut_windows(levels[:, :, 0].permute(2, 0, 1), b, x, y, sides[b, a].long())
-    contact = member & (window == best[x, y, a, b][:, None, None])
-    sure, maybe = inside(contact, middle[:, a, b].T, centres)
-    mask[rows] = sure
-    unsure = torch.stack(rows, 1)[maybe & ~sure]
+    n, i, x, y = undecided.T
+    boxes = sides[n, i].long()
+    most = int(boxes[:, 0].max()), int(boxes[:, 1].max())
+    window, member = cut_windows(levels[:, :, 0].permute(2, 0, 1), n, x, y, boxes, most)
+    contact = member & (window == best[x, y, i, n][:, None, None])
+    sure, maybe = inside(contact, windows.middle[:, i, n].T, windows.centres)
+    mask[n, i, x, y] = sure
+    unsure = undecided[maybe & ~sure]
     return mask, unsure if len(unsure) else None
 
 

@@ -95,19 +95,25 @@ def _bearing_compiled(bins: Bins) -> Tensor:
 
 
 def _bearing_tensor(bins: Bins) -> Tensor:
-    """Compute :func:`lbcp_bearing` in tensor code, box by box and for all bins at once."""
+    """Compute :func:`lbcp_bearing` in tensor code, box by box and for all bins at once.
+
+    The program waits for the device once, to read the largest number of boxes and their sides.
+    """
     n, (width, depth, _) = len(bins), bins.size
     heightmap = torch.zeros_like(bins.heightmap)
     bearing = torch.ones_like(heightmap, dtype=torch.bool)
-    for k in range(int(bins.count.max()) if n else 0):
-        which = torch.nonzero(bins.count > k).squeeze(1)
-        corner, z, sides = bins.boxes[which, k].long().tensor_split((2, 3), 1)
+    if not bins.boxes.numel():
+        return bearing
+    real = torch.arange(bins.boxes.shape[1], device=bins.device) < bins.count[:, None]
+    boxes = torch.where(real[..., None], bins.boxes, 0).long()
+    w, d, count = torch.stack((*boxes[..., 3:5].amax((0, 1)), bins.count.amax())).tolist()
+    index = torch.arange(n, device=bins.device)
+    for k in range(count):
+        corner, z, sides = boxes[:, k].tensor_split((2, 3), 1)
         under = footprint(width, depth, sides, corner)
         x, y = corner.T
-        below = heightmap[which]
-        contact = bearing[which] & (below == z[:, None]) & under
-        rows = torch.arange(len(which), device=bins.device)
-        window, member = cut_windows(contact, rows, x, y, sides)
+        contact = bearing & (heightmap == z[:, None]) & under
+        window, member = cut_windows(contact, index, x, y, sides, (w, d))
         present, upper, lower = boundary(window & member)
         top, bottom = _rounded(upper, present), _rounded(lower, present)
         top = torch.minimum(top[:, :-1], top[:, 1:])  # over each row of cells
@@ -117,9 +123,8 @@ def _bearing_tensor(bins: Bins) -> Tensor:
         i = i.clamp(0, top.shape[1] - 1)
         above_lower = j[:, None, :] >= -bottom.gather(1, i)[:, :, None]
         below_upper = j[:, None, :] + 1 <= top.gather(1, i)[:, :, None]
-        bearing[which] = torch.where(under, above_lower & below_upper, bearing[which])
-        place_boxes(below, torch.zeros_like(below), under, sides[:, 2])
-        heightmap[which] = below
+        bearing = torch.where(under, above_lower & below_upper, bearing)
+        place_boxes(heightmap, torch.zeros_like(heightmap), under, sides[:, 2])
     return bearing
 
 

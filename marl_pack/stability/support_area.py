@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.geometry.compiled import mark_valid, slide
-from marl_pack.geometry.tensor import resting_heights, window_sum, windows_inside
+from marl_pack.geometry.tensor import bins_last, shift, slide_counts
 from marl_pack.installation import njit
 from marl_pack.stability.centres import exact
 from marl_pack.stability.parameters import Thresholds
@@ -108,30 +108,24 @@ def mask_compiled(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thr
 def mask_tensor(heightmap: Tensor, sides: Tensor, height: int, thresholds: Thresholds) -> Tensor:
     """Compute the masks of the rule in tensor code; the arguments are those of mask_compiled.
 
-    A summed-area table counts the cells at each level.
+    Each window is joined from parts: of each, the highest level and its cells are known.
     """
-    n, width, depth = heightmap.shape
-    count = sides.shape[1]
-    flat = sides.flatten(0, 1).long()
-    z = resting_heights(heightmap, sides)
-    top = z + sides[..., 2, None, None].long()
-    possible = windows_inside(flat, width, depth).view(z.shape) & (top <= height)
-    w, d = flat[:, 0].clamp(1, width), flat[:, 1].clamp(1, depth)
-    w, d = (side.view(n, count, 1, 1) for side in (w, d))
-    area = torch.zeros_like(z, dtype=torch.int64)
-    for level in torch.unique(heightmap).tolist():
-        area = torch.where(z == level, window_sum(heightmap == level, w, d), area)
-
-    b = torch.arange(n, device=z.device)[:, None, None, None]
-    x = torch.arange(width, device=z.device)[:, None]
-    y = torch.arange(depth, device=z.device)[None, :]
-    last_x, last_y = (x + w).clamp(max=width) - 1, (y + d).clamp(max=depth) - 1
+    width, depth = heightmap.shape[1:]
+    w, d, h = sides.permute(2, 1, 0).contiguous().long()  # [A, N] each
+    x, y = (torch.arange(side, device=w.device)[:, None, None] for side in (width, depth))
+    x_fits, y_fits = (w > 0) & (h > 0) & (x <= width - w), (d > 0) & (y <= depth - d)
+    w, d = w.clamp(1, width), d.clamp(1, depth)
+    heights = bins_last(heightmap.to(torch.uint8 if height <= 255 else torch.int16))
+    rows = slide_counts(heights, torch.ones_like(heights, dtype=torch.int32), d, 1, depth)
+    z, area = slide_counts(rows[0], rows[1], w, 0, width)
+    far = shift(heights, w - 1, 0, width - 1)
     supported = sum(
-        (heightmap[b, cx, cy] == z).long()
-        for cx, cy in ((x, y), (x, last_y), (last_x, y), (last_x, last_y))
+        (side == z).to(torch.uint8) + (shift(side, d - 1, 1, depth - 1) == z)
+        for side in (heights, far)
     )
-    fewest = _fewest_cells(sides, thresholds)[:, :, None, None]
-    stands = torch.zeros_like(possible)
-    for k, (_, corners) in enumerate(thresholds):
-        stands |= (area >= fewest[..., k]) & (supported >= corners)
-    return possible & stands
+    fewest = _fewest_cells(sides, thresholds).permute(2, 1, 0).contiguous().int()
+    stands = torch.zeros_like(z, dtype=torch.bool)
+    for (_, corners), cells in zip(thresholds, fewest, strict=True):
+        stands |= (area >= cells) & (supported >= corners)
+    stands &= x_fits[:, None] & y_fits & (z <= height - h)
+    return stands.permute(3, 2, 0, 1).contiguous()

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, reduce
 from itertools import product
 from typing import Any
 
@@ -39,6 +39,10 @@ SURFACE = SHARES + 1 + STEPS
 """Number of entries of :attr:`Afterstates.surface` for each placement."""
 AT_ONCE = 1 << 20
 """Number of cells of the masks that are computed at once."""
+CELLS_AT_ONCE = 1 << 20
+"""Number of cells of the maps that tensor code computes at once on the CPU."""
+MOST_WINDOW_CELLS = 256
+"""Largest window whose test tensor code writes out for all its rows."""
 PER_THREAD = 256
 """Smallest number of placements for which several threads share the work."""
 
@@ -335,39 +339,137 @@ def _probability_compiled(counts: Tensor, axes: list[tuple[int, int, int]]) -> T
 
 
 def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
-    """Compute :func:`afterstates_of` in tensor code."""
+    """Compute :func:`afterstates_of` in tensor code; the program waits for the number K once."""
     width, depth, height = bins.size
-    device = bins.device
-    boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16, device=device)
     placements = mask.nonzero()
     index = (mask.flatten().cumsum(0) - 1).clamp(min=0).view(mask.shape)
-    at_once = AT_ONCE if device.type == "cpu" else AT_ONCE << 6
+    longest = [max((i for i in lengths if i <= side), default=0) for side in (width, depth)]
+    small = longest[0] * longest[1] <= MOST_WINDOW_CELLS
+    count_cells = _count_by_rows if small else _count_by_masks
+    at_once = CELLS_AT_ONCE if bins.device.type == "cpu" else CELLS_AT_ONCE << 8
+    at_once = max(1, at_once // (width * depth * (1 if small else len(lengths) ** 2)))
     counts, surface, waste = [], [], []
-    for part in torch.split(placements, max(1, at_once // (len(boxes) * width * depth))):
+    for part in torch.split(placements, at_once):
         b, a = part[:, 0], part[:, 1]
         box, heightmap, empty_map = sides[b, a], bins.heightmap[b], bins.empty_map[b]
         under = footprint(width, depth, box, part[:, 2:])
         waste.append(place_boxes(heightmap, empty_map, under, box[:, 2])[1])
-        legal, _ = hull_tensor.support_mask(
-            heightmap, empty_map, boxes.expand(len(part), -1, -1).contiguous(), height
-        )
-        counts.append(legal.sum((2, 3), dtype=torch.int32))
-        surface.append(_surface(heightmap.long(), height))
+        counts.append(count_cells(heightmap, empty_map, lengths, height))
+        surface.append(_surface(heightmap, height))
     volume = sides[placements[:, 0], placements[:, 1]].long().prod(1)
     return Afterstates(
-        index, torch.cat(counts).view(-1, *[len(lengths)] * 3), torch.cat(surface), volume,
+        index, torch.cat(counts), torch.cat(surface), volume,
         torch.cat(waste), bins.filled[placements[:, 0]] + volume, bins.backend,
     )  # fmt: skip
 
 
+def _count_by_masks(
+    heightmap: Tensor, empty_map: Tensor, lengths: tuple[int, ...], height: int
+) -> Tensor:
+    """Count the cells where each box could be placed on maps [K, W, D], int32 [K, L, L, L]."""
+    boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16)
+    boxes = boxes.to(heightmap.device).expand(len(heightmap), -1, -1)
+    legal, _ = hull_tensor.support_mask(heightmap, empty_map, boxes, height)
+    return legal.sum((2, 3), dtype=torch.int32).view(-1, *[len(lengths)] * 3)
+
+
+def _count_by_rows(
+    heightmap: Tensor, empty_map: Tensor, lengths: tuple[int, ...], height: int
+) -> Tensor:
+    """Count as :func:`_count_by_masks` does, but without reading a window cell by cell.
+
+    A window's middle lies strictly inside the hull of its contact cells iff each of the sets in
+    :func:`_blocking_sets` contains a contact cell: the largest K
+    (:mod:`marl_pack.stability.hull_compiled`) of each set is that of the window.
+    """
+    kind = torch.uint8 if height <= 126 else torch.int16
+    level = (2 * heightmap + (empty_map == 0)).to(kind).permute(1, 2, 0).contiguous()
+    width, depth, count = level.shape  # the placements are last, so that loops run along them
+    counts = torch.zeros([len(lengths)] * 3 + [count], dtype=torch.int32, device=level.device)
+    runs = [level]  # the largest K of 1, 2, … cells along y
+    for cells in range(1, max((d for d in lengths if d <= depth), default=1)):
+        runs.append(torch.maximum(runs[-1][:, :-1], level[:, cells:]))
+    for (i, w), (j, d) in product(enumerate(lengths), repeat=2):
+        if w > width or d > depth:
+            continue
+        shape = width - w + 1, depth - d + 1
+        best = _largest(runs, tuple((x, 0, d) for x in range(w)), shape)
+        least = reduce(
+            torch.minimum, (_largest(runs, rows, shape) for rows in _blocking_sets(w, d))
+        )
+        stands = (least == best) & (best & 1).bool()
+        for k, tall in enumerate(lengths):
+            if tall <= height:  # a comparison of two tensors is faster than one with a number
+                low = best.clamp(max=2 * (height - tall) + 1) == best
+                counts[i, j, k] = _cells(stands & low)
+    return counts.permute(3, 0, 1, 2).contiguous()
+
+
+def _largest(
+    runs: Sequence[Tensor], rows: Sequence[tuple[int, int, int]], shape: tuple[int, int]
+) -> Tensor:
+    """Compute the largest K of a set of cells in each window.
+
+    Args:
+        runs: the largest K of 1, 2, … cells along y, [W, ≤ D, K] each.
+        rows: the set of cells: row, first cell and number of cells of each run.
+        shape: number of windows along x and y.
+    """
+    parts = (runs[cells - 1][x : x + shape[0], y : y + shape[1]] for x, y, cells in rows)
+    return reduce(torch.maximum, parts)
+
+
+@cache
+def _blocking_sets(w: int, d: int) -> tuple[tuple[tuple[int, int, int], ...], ...]:
+    """Find the sets of cells of a w × d window without which its middle is not inside a hull.
+
+    For a line through the middle, these are the cells that reach over it to one side. If no cell of
+    such a set is in contact, all contact lies on the other side. It is enough to know the smallest
+    sets; their lines go through corners of cells.
+
+    Returns:
+        The sets; each as rows of adjacent cells: row, first cell, number of cells.
+    """
+    corners = product(range(-w, w + 1, 2), range(-d, d + 1, 2))  # from the middle, in half cells
+    sets = set()
+    for x, y in corners:
+        for a, b in ((-y, x), (y, -x)):  # a cell reaches to the side (a, b) by its last corner
+            cells = [
+                (i, j)
+                for i, j in product(range(w), range(d))
+                if a * (2 * i + 1 - w) + b * (2 * j + 1 - d) + abs(a) + abs(b) > 0
+            ]
+            sets.add(frozenset(cells))
+    sets.discard(frozenset())
+    smallest = [cells for cells in sets if not any(other < cells for other in sets)]
+    runs = []
+    for part in smallest:
+        of_row = {i: [j for x, j in part if x == i] for i, _ in part}
+        runs.append(tuple((i, min(js), len(js)) for i, js in sorted(of_row.items())))
+    return tuple(sorted(runs))
+
+
 def _surface(heights: Tensor, height: int) -> Tensor:
-    """Compute :attr:`Afterstates.surface` of maps int64 [K, W, D]."""
-    steps = [heights.diff(dim=axis).abs().flatten(1) for axis in (1, 2)]
-    step = (torch.cat(steps, 1) * SHARES // height).clamp(max=STEPS - 1)
-    share = (heights * SHARES // height).flatten(1)
-    kinds = torch.arange(max(SHARES + 1, STEPS), device=heights.device)[:, None, None]
-    shares = (share == kinds[: SHARES + 1]).sum(2).T / share.shape[1]
-    return torch.cat((shares, (step == kinds[:STEPS]).sum(2).T / max(1, step.shape[1])), 1)
+    """Compute :attr:`Afterstates.surface` of maps int16 [K, W, D]."""
+    maps = heights.to(torch.uint8 if height <= 255 else torch.int16).permute(1, 2, 0).contiguous()
+    pairs = (maps[1:], maps[:-1]), (maps[:, 1:], maps[:, :-1])
+    steps = [torch.maximum(*pair) - torch.minimum(*pair) for pair in pairs]
+    shares = []
+    for values, classes in (([maps], SHARES + 1), (steps, STEPS)):
+        cells = max(1, sum(part.shape[0] * part.shape[1] for part in values))
+        lowest = [-(-k * height // SHARES) for k in range(classes)]  # of each class
+        above = torch.zeros(len(heights), classes + 1, device=maps.device)  # in a higher class
+        for k, low in enumerate(lowest):
+            for part in values:
+                above[:, k] += _cells(part.clamp(min=low) == part)
+        shares.append((above[:, :-1] - above[:, 1:]) / cells)
+    return torch.cat(shares, 1)
+
+
+def _cells(which: Tensor) -> Tensor:
+    """Count the true cells of maps [W, D, K], int32 [K]."""
+    small = which.shape[0] * which.shape[1] <= 255  # bytes are added many times faster
+    return which.view(torch.uint8).sum((0, 1), dtype=torch.uint8 if small else torch.int32).int()
 
 
 def _probability_tensor(counts: Tensor, axes: list[tuple[int, int, int]]) -> Tensor:

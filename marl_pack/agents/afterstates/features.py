@@ -34,11 +34,9 @@ def features(afterstates: Afterstates, volume: int, rows: Tensor | None = None) 
     first = MOST_LENGTHS - lengths
     both = counts + counts.transpose(1, 2)  # as it comes and rotated by 90°
     i, j = torch.triu_indices(lengths, lengths, device=counts.device)
-    w, _ = torch.triu_indices(MOST_LENGTHS, MOST_LENGTHS, device=counts.device)
     values = torch.zeros(len(counts), FEATURES, device=counts.device)
     boxes = values[:, 2 : 2 + PAIRS * MOST_LENGTHS].view(-1, PAIRS, MOST_LENGTHS)
-    used = (w >= first).nonzero().squeeze(1)  # in the order of i, j
-    boxes[:, used, first:] = both[:, i, j].float().log1p() / 2
+    boxes[:, PAIRS - i.numel() :, first:] = both[:, i, j].float().log1p() / 2
     share = filled.float() / volume
     values[:, 0], values[:, 1] = share, share.square()
     values[:, 2 + PAIRS * MOST_LENGTHS :] = 2 * surface
