@@ -16,6 +16,7 @@ from benchmarks.record import Measurements
 from benchmarks.timing import devices
 from marl_pack import env_aec
 from marl_pack.agents.heuristics import make_policy
+from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
 
 
@@ -45,6 +46,9 @@ def batched(measured: Measurements) -> None:
         for n in (1, 64, 1024, 4096) if device == "cpu" else (1024, 4096, 16384, 65536):
             speed = steps_per_second(Packing(n, device=device))
             measured.keep(f"N = {n:,}, {device}", steps_per_second=speed)
+    for n in (64, 1024):
+        speed = steps_per_second(Packing(n, backend=Backend.TENSOR))
+        measured.keep(f"N = {n:,}, cpu, tensor code", steps_per_second=speed)
 
 
 def scaling(measured: Measurements) -> None:

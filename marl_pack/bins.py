@@ -54,6 +54,7 @@ class Bins:
     filled: Tensor  # int64 [N]            cells filled by boxes
     height: int  # H
     backend: Backend  # computes placements, masks and afterstates
+    untouched: bool = False  # the bins are empty and stay so: no code needs to read their maps
 
     @property
     def size(self) -> Size:
@@ -95,6 +96,7 @@ class Bins:
         """Return the bins with ``change`` applied to every tensor."""
         # Arguments by position: dataclasses.replace would take as long as the changes.
         values: list[Any] = [*map(change, self.tensors()), self.height, self.backend]
+        values.append(self.untouched)
         return Bins(*values)
 
     def tensors(self) -> tuple[Tensor, ...]:
@@ -198,7 +200,6 @@ def place(
     com: Tensor | None = None,
     labels: tuple[Tensor, Tensor] | None = None,
     unit: float = 1.0,
-    *,
     check: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Place one box in each bin from above and update the bins (Algorithm 2 for the empty map).

@@ -35,6 +35,7 @@ GAMES = (
     {"com_offset": (0.3, 0.2, 0.0)},
     {"bin": (3, 40, 9), "sides": (1, 3)},
     {"bin": (64, 2, 9), "sides": (1, 2)},
+    {"bin": (18, 18, 18), "sides": (4, 17)},
     {"bin": (14, 6, 6), "items": [[2, 2, 2], [13, 2, 2], [3, 4, 5]] * 4},
 )
 
@@ -206,6 +207,24 @@ def test_masks_of_larger_maps_are_equal(rule: str, size: tuple[int, int, int]) -
                 masks = [bound(replace(bins, backend=backend), item) for backend in Backend]
                 for mask in masks[1:]:
                     assert torch.equal(mask, masks[0])
+
+
+@pytest.mark.parametrize("size", [(12, 9, 130), (24, 20, 16), (26, 20, 16)])
+def test_masks_of_rough_maps_are_equal(size: tuple[int, int, int]) -> None:
+    """Where columns differ at random, the quadrants leave many windows to the exact test."""
+    generator = torch.Generator().manual_seed(3)
+    bins = state.empty(8, size, 0)
+    bins.heightmap.copy_(torch.rand(bins.heightmap.shape, generator=generator) < 0.1)
+    bins.empty_map.copy_(torch.rand(bins.heightmap.shape, generator=generator) < 0.2)
+    bins.heightmap[::2] *= size[2] - 4  # the largest numbers
+    for items in (some_items(8, (2, 4), 1), some_items(8, (3, 9), 2), some_items(8, (6, 12), 3)):
+        for item in (orient_item(items), off_centre(items, 4)):
+            for margin in (0.0, 0.7):
+                compiled, tensor = (
+                    hull_alpha(replace(bins, backend=backend), item, margin) for backend in Backend
+                )
+                assert torch.equal(compiled, tensor)
+                assert compiled.any()
 
 
 def hull_alpha_play(

@@ -126,7 +126,8 @@ class Packing(Copied):
         self._games = torch.arange(n, device=self.device)
         self.bin_height = torch.full((n, 1), height, dtype=torch.int16, device=self.device)
         self._gain, self._loss = self.spec.alpha / self.volume, self.spec.beta / self.volume
-        self._empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
+        empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
+        self._empty = replace(empty, untouched=True)
         self._all_fit = self.backend is Backend.TENSOR and self._every_item_fits()
         self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.reset(first_episode=first_episode)
@@ -507,7 +508,7 @@ class Packing(Copied):
         corners = torch.stack(self.floor.corner(cell), 1)
         labels = self.items.ids_at(state.t), orientation
         _, waste, volume = bin_state.place(
-            state.bins, sides, corners, self.items.weights, com, labels, unit, check=check
+            state.bins, sides, corners, self.items.weights, com, labels, unit, check
         )
         # R = α · w d h / (W D H) - β · v_waste / (W D H)
         reward = (self._gain * volume.double() - self._loss * waste.double()).float()

@@ -32,11 +32,11 @@ in each orientation and is stable by the rule. The rule's parameters are bound a
 
 
 @cache  # an import statement takes a tenth of the time of a mask
-def _hull_mask(backend: Backend, empty: bool) -> Callable[..., Any]:
-    """Return the function that computes convex-hull masks; ``empty``: the bins have no boxes."""
+def _hull_mask(backend: Backend, untouched: bool) -> Callable[..., Any]:
+    """Return the function that computes convex-hull masks; ``untouched`` as in ``Bins``."""
     from marl_pack.stability import hull_compiled, hull_tensor
 
-    tensor_code = hull_tensor.flat_mask if empty else hull_tensor.support_mask
+    tensor_code = hull_tensor.flat_mask if untouched else hull_tensor.support_mask
     return backend.pick(compiled=hull_compiled.support_mask, tensor=tensor_code)
 
 
@@ -53,7 +53,7 @@ def _supported(bins: Bins, item: OrientedItem, empty_map: Tensor, margin: float)
     centres = None
     if item.offsets is not None or margin > 0:
         centres = item.centre_table(margin, max(bins.size[:2]))
-    code = _hull_mask(bins.backend, bins.boxes.shape[1] == 0)
+    code = _hull_mask(bins.backend, bins.untouched)
     mask, unsure = code(bins.heightmap, empty_map, item.sides, bins.height, centres)
     for n, a, x, y in [] if unsure is None else unsure.tolist():
         from marl_pack.stability import reference
