@@ -228,7 +228,7 @@ def place(
         ValueError: if a bin is full, or a box reaches out of the map. The bins have not changed
             then.
     """
-    if check and bins.backend is Backend.TENSOR:
+    if bins.backend.pick(compiled=False, tensor=check):
         _check_boxes(bins, sides, corners)
     code = bins.backend.pick(compiled=_place_compiled, tensor=_place_tensor)
     return code(bins, sides, corners, weights, com, labels, unit)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from marl_pack.backend import default_backend
+from marl_pack.backend import Backend, default_backend
 from marl_pack.installation import njit
 
 GOLDEN, _MIX_1, _MIX_2 = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
@@ -43,9 +43,10 @@ def below(bits: Tensor, limit: int) -> Tensor:
     return _shift_right(_shift_right(bits, 32) * limit, 32)
 
 
-def episode_keys(seed: int, episodes: Tensor) -> Tensor:
+def episode_keys(seed: int, episodes: Tensor, backend: Backend | None = None) -> Tensor:
     """Return one independent key, int64 [K], for each episode of a seed."""
-    code = default_backend(episodes.device).pick(compiled=_keys_compiled, tensor=_keys_tensor)
+    chosen = default_backend(episodes.device) if backend is None else backend
+    code = chosen.pick(compiled=_keys_compiled, tensor=_keys_tensor)
     return code(_signed(seed), episodes)
 
 

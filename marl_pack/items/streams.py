@@ -153,7 +153,7 @@ class Uniform:
 
     def start(self, seed: int, episodes: Tensor) -> Tensor:
         """Return the episodes' keys, int64 [K]."""
-        return episode_keys(seed, episodes)
+        return episode_keys(seed, episodes, self.backend)
 
     def restart(self, state: Tensor, seed: int, episodes: Tensor, ended: Tensor) -> Tensor:
         """Return the keys, new where episodes have ended."""
