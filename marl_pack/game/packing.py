@@ -571,8 +571,11 @@ class Packing(Copied):
         """Return whether every item of the stream surely has a legal cell in an empty bin.
 
         In an orientation in which the longest cube fits, every item fits. If the shortest cube is
-        stable on the floor in an orientation, every larger footprint is.
+        stable on the floor in an orientation, every larger footprint is, by the rules of
+        :mod:`marl_pack.stability`.
         """
+        if not isinstance(self.spec.rule, str):  # a function may refuse any item
+            return False
         shortest, longest = self.stream.sides
         sides = torch.tensor([[shortest] * 3, [longest] * 3], dtype=torch.int16, device=self.device)
         bins = bin_state.empty(2, self.size, 0, self.device, self.backend)
