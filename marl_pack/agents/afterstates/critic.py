@@ -61,7 +61,7 @@ class AfterstateLearner:
         self, critic: AfterstateCritic, lookahead: Lookahead, steps: int, games: int
     ) -> None:
         self.critic, self.lookahead = critic, lookahead
-        self.optimizer = torch.optim.Adam(critic.parameters())
+        self.optimizer = torch.optim.Adam(critic.parameters(), fused=True)
         device = next(critic.parameters()).device
         self.capacity = max(1, REMEMBERED // (steps * games))  # rollouts
         shape = self.capacity, steps, games

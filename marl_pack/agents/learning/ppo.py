@@ -26,10 +26,12 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning.cloning import Teacher
 from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
+from marl_pack.agents.networks.planes import encoded
+from marl_pack.agents.networks.sight import Observation
 from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
 
-KL_SAMPLES = 1024  # states on which the KL divergence of an update is measured
+KL_SAMPLES = 256  # states on which the KL divergence of an update is measured
 
 
 @dataclass
@@ -138,12 +140,17 @@ class PackingPPO:
     # --- the rollout ------------------------------------------------------------------------------
 
     def _observation(self, seat: Seat, before: Choice, first: TensorDict) -> TensorDict:
-        """Return what an agent observes at its turn: ``first`` if its turn is the first."""
-        if not before or seat.ppo is None:
+        """Return what a learner observes at its turn: ``first`` if its turn is the first.
+
+        It is encoded here, once for acting and for all passes of the update.
+        """
+        if seat.ppo is None:
             return first
         game = self.env.game
-        observation = observe(seat.kind.name, game, seat.planes, self.lookahead, *before)
-        return TensorDict(observation, batch_size=[game.n], device=game.device)
+        observation = first
+        if before:
+            observation = observe(seat.kind.name, game, seat.planes, self.lookahead, *before)
+        return _encoded(observation, seat.planes)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Return the chosen orientations and cells, int64 [G, 2]; record the learners' choices.
@@ -331,7 +338,7 @@ class PackingPPO:
             zeros = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
             before = (zeros,) if seats else ()
             example = observe(name, env.game, planes, lookahead, *before)
-            example = TensorDict(example, batch_size=[env.num_envs], device=env.device)
+            example = _encoded(example, planes)
             teacher = None
             if name in teachers:
                 length, share = settings["teacher_iterations"], settings["teacher_random"]
@@ -349,6 +356,12 @@ class PackingPPO:
                 lookahead.critic, lookahead, cfg["num_steps_per_env"], env.num_envs
             )
         return PackingPPO(seats, env, lookahead, algorithm["iterations"], afterstates)
+
+
+def _encoded(observation: Observation, planes: Sequence[str]) -> TensorDict:
+    """Return an observation of G games with its input channels, as rsl_rl stores it."""
+    mask = observation["mask"]
+    return TensorDict(encoded(observation, planes), batch_size=[len(mask)], device=mask.device)
 
 
 def _stock_ppo(
@@ -377,4 +390,8 @@ def _stock_ppo(
     single = SimpleNamespace(num_envs=env.num_envs, num_actions=1)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints both networks
         ppo: PPO = PPO.construct_algorithm(obs, single, agent_cfg, device)
+    optimizer = ppo.optimizer
+    if "fused" in optimizer.defaults:  # the same steps, one call for all weights
+        weights = optimizer.param_groups[0]["params"]
+        ppo.optimizer = type(optimizer)(weights, lr=ppo.learning_rate, fused=True)
     return ppo

@@ -15,6 +15,8 @@ from marl_pack.checks import real_number, shown
 
 NOT_NEGATIVE = ("step", "exp_avg_sq", "square_avg")
 """Names of torch's moments and counters that are never negative."""
+WAYS_TO_COMPUTE = ("foreach", "fused")
+"""Names of torch's settings that change how an optimiser computes its steps, not what they are."""
 TWISTER_WORDS = 624
 """Number of words of the Mersenne twister's state."""
 
@@ -42,7 +44,8 @@ def checked_optimizer(
     """Return an optimiser's state after checking that ``optimizer`` may load it.
 
     Only the learning rate changes during a run, so all other settings must be equal. Settings that
-    the state lacks, because another version of torch wrote it, are those of ``optimizer``.
+    the state lacks, because another version of torch wrote it, are those of ``optimizer``; so are
+    :data:`WAYS_TO_COMPUTE`.
 
     Args:
         state: the ``state_dict`` to check.
@@ -63,7 +66,7 @@ def checked_optimizer(
         if real_number(group.get("lr"), f"{name}.lr") < 0:
             raise ValueError(f"{name}.lr = {group['lr']}: needs 0 or more")
         for key, value in group.items():
-            if key != "lr" and (key not in needed or not _equal(value, needed[key])):
+            if key not in ("lr", *WAYS_TO_COMPUTE) and (key not in needed or not _equal(value, needed[key])):
                 needs = shown(needed[key]) if key in needed else "none"
                 raise ValueError(f"{name}.{key}: is {shown(value)}, needs {needs}")
         groups.append(needed | {"lr": group["lr"]})

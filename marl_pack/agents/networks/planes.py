@@ -261,6 +261,19 @@ def need_critic(planes: Iterable[str]) -> bool:
     return any(name in PLANES and PLANES[name].needs_critic for name in planes)
 
 
+ENCODED = "input_channels"
+"""The tensor float32 [G, W, D, C] of an encoded observation (:func:`encoded`)."""
+
+
+def encoded(observation: Observation, planes: Sequence[str]) -> dict[str, Tensor]:
+    """Return the observation with its input channels in place of the tensors they are made of.
+
+    A network computes the same from both. What is observed often is so encoded only once.
+    """
+    channels = input_channels(observation, planes).movedim(1, 3)
+    return {ENCODED: channels, "mask": observation["mask"]}
+
+
 def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
     """Build a network's input: the paper's four channels, then those of the planes.
 
@@ -269,7 +282,7 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
 
     Args:
         observation: ``heightmap`` int [G, W, D], ``item`` int [G, 3], ``height`` int [G, 1] (H),
-            and the tensors of the planes.
+            and the tensors of the planes; or these, :func:`encoded`.
         planes: names in :data:`PLANES`.
 
     Returns:
@@ -277,6 +290,8 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
     """
     import torch
 
+    if ENCODED in observation:
+        return observation[ENCODED].movedim(3, 1)
     heightmap, item = observation["heightmap"], observation["item"].float()
     width, depth = heightmap.shape[1:]
     height = observation["height"].float()  # [G, 1]
