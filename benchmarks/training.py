@@ -20,11 +20,11 @@ from benchmarks.record import Measurements
 from benchmarks.timing import devices
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.config import parse
-from marl_pack.training.assembly import make_runner
+from marl_pack.training.assembly import fast_precision, make_runner
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 TRAINED = ("paper", "plain")
-"""Names of the configs whose training is measured."""
+"""Names of the configs whose training is measured with many bins."""
 PARTS = ("game", "networks", "rsl_rl", "rest")
 
 
@@ -78,12 +78,12 @@ def watched(runner: Runner, split: Split) -> None:
 
 
 def measure(
-    config_name: str, device: str, bins: int, seconds: float
+    config_name: str, device: str, seconds: float, *options: str
 ) -> tuple[float, dict[str, float]]:
     """Return items per second of CPU time (on CUDA of wall time), and the share of each part."""
     config, _ = parse([
-        f"--config={CONFIGS / config_name}.yaml", f"--ppo.num_envs={bins}", f"--device={device}",
-        "--evaluation.every=0",
+        f"--config={CONFIGS / config_name}.yaml", f"--device={device}", "--evaluation.every=0",
+        *options,
     ])  # fmt: skip
     on_cpu = device == "cpu"
 
@@ -95,7 +95,7 @@ def measure(
 
     runner = make_runner(config, None)
     runner.train(1)
-    items = bins * config.ppo.num_steps_per_env
+    items = config.ppo.num_envs * config.ppo.num_steps_per_env
     best, done, start = 0.0, 1, clock()
     while clock() - start < seconds or done < 4:
         begun = clock()
@@ -129,11 +129,17 @@ def main() -> None:
     chosen = measured.parse()
     torch.set_num_threads(1)
     for device in devices():
-        for config in TRAINED:
-            for bins in (256, 1024) if device == "cpu" else (4096, 16384):
-                rate, shares = measure(config, device, bins, chosen.seconds)
-                key = f"{config}, N = {bins:,}, {device}"
-                measured.keep(key, items_per_second=rate, **shares)
+        rows = [
+            (f"{config}, N = {bins:,}", config, f"--ppo.num_envs={bins}")
+            for config in TRAINED
+            for bins in ((256, 1024) if device == "cpu" else (4096, 16384))
+        ]
+        rows.append(("default", "default", "--ppo.precision=float32"))
+        if fast_precision("bfloat16", device):
+            rows.append(("default, bfloat16", "default", "--ppo.precision=bfloat16"))
+        for name, config, option in rows:
+            rate, shares = measure(config, device, chosen.seconds, option)
+            measured.keep(f"{name}, {device}", items_per_second=rate, **shares)
 
 
 if __name__ == "__main__":

@@ -124,6 +124,8 @@ MUTATIONS = (
     _m("training: the learning rate of the optimizer stays", "agents/learning/ppo.py",
        'group["lr"] = self.ppo.learning_rate', "pass",
        "ppo::learning_rate_and_entropy_follow_their_schedules"),
+    _m("training: the precision does not reach the convolutions", "agents/networks/trunk.py",
+       "inputs.to(self.precision)", "inputs", "ppo::in_bfloat16_an_update_moves_the_weights_as"),
     _m("training: a huge logit passes the mask", "agents/networks/distribution.py",
        "logits.float().clamp(-LARGEST, LARGEST)", "logits.float()", "distribution"),
     _m("training: exchanging x and y leaves orientations", "agents/networks/symmetry.py",

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents.learning.runner import Runner
+from marl_pack.agents.networks.planes import ENCODED
 from marl_pack.config import Config, parse
 
 PLAIN = f"--config={Path(__file__).parent.parent / 'configs' / 'plain.yaml'}"
@@ -51,6 +52,13 @@ def rollout(runner: Runner) -> TensorDict:
             obs, *rest = runner.env.step(actions)
             runner.alg.process_env_step(obs, *rest)
     return obs
+
+
+def recorded_game(observations: TensorDict, size: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """Return the heightmaps and the items' sides, int16 in cells, in encoded observations."""
+    channels = observations[ENCODED]
+    sides = channels[..., 0, 0, 1:4] * torch.tensor(size)
+    return (channels[..., 0] * size[2]).round().short(), sides.round().short()
 
 
 def same(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> bool:

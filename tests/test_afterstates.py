@@ -22,7 +22,7 @@ from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.agents.loading import Loader
 from marl_pack.agents.networks.kinds import observe
-from marl_pack.agents.networks.planes import input_channels
+from marl_pack.agents.networks.planes import ENCODED, input_channels
 from marl_pack.bins import place
 from marl_pack.config import parse
 from marl_pack.game.moves import Moves
@@ -292,7 +292,7 @@ def test_after_learning_the_agents_observe_values_of_the_new_critic() -> None:
     runner = small_runner(None, *BOTH_SEE_VALUES)
     critic = runner.alg.lookahead.critic
     assert isinstance(critic, AfterstateCritic)
-    observations = []
+    observations, planes = [], ["mask", "afterstate_value"]
     act = runner.alg.act
 
     def spied(obs: dict[str, Tensor]) -> Tensor:
@@ -300,9 +300,9 @@ def test_after_learning_the_agents_observe_values_of_the_new_critic() -> None:
         expected = Lookahead(critic).afterstate_value(game)  # computed by the critic as it is
         observations.append(torch.equal(obs["afterstate_value"], expected))
         actions = act(obs)
-        second = runner.alg.learners["placement"].transition.observations["afterstate_value"]
-        own = Moves.gather(expected, actions[:, 0])[:, None]
-        observations.append(torch.equal(second, own))
+        second = runner.alg.learners["placement"].transition.observations[ENCODED]
+        own = observe("placement", runner.env.game, planes, Lookahead(critic), actions[:, 0])
+        observations.append(torch.equal(second.movedim(3, 1), input_channels(own, planes)))
         return actions
 
     runner.alg.act = spied  # type: ignore[method-assign]  # a test watches it

@@ -13,7 +13,12 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice, observe
-from marl_pack.agents.networks.planes import PLANES, channel_names, input_channels
+from marl_pack.agents.networks.planes import (
+    PLANES,
+    channel_names,
+    encode_observation,
+    input_channels,
+)
 from marl_pack.agents.networks.shape import Network
 from marl_pack.agents.networks.symmetry import mirror_actions, mirror_observation
 from marl_pack.agents.networks.trunk import Trunk, widen
@@ -170,9 +175,9 @@ def test_three_layers_without_context_reach_three_cells_far() -> None:
         "item": torch.ones(1, 3),
         "height": torch.full((1, 1), 10),
     }
-    flat = trunk(observation).whole
+    flat = trunk(observation).cells
     observation["heightmap"][0, 7, 7] = 5
-    changed = (trunk(observation).whole != flat).any(1)[0].nonzero()
+    changed = (trunk(observation).cells != flat).any(1)[0].nonzero()
     assert changed.min(0).values.tolist() == [4, 4]
     assert changed.max(0).values.tolist() == [10, 10]
 
@@ -180,10 +185,25 @@ def test_three_layers_without_context_reach_three_cells_far() -> None:
 def test_with_a_shortcut_the_heads_see_the_input_channels() -> None:
     observation = observed("orientation", Packing(3, seed=1), ("mask", "feasible_cells"))
     network = Network(channels=4, layers=2, planes=["mask", "feasible_cells"], shortcut=True)
-    features = Trunk(6, network)(observation).whole
-    channels = input_channels(observation, network.planes)
-    assert features.shape == (3, 4 + 4 + 6 + 7, 10, 10)
-    assert torch.equal(features[:, 4:], channels)
+    features = Trunk(6, network)(observation)
+    assert features.cells.shape == (3, 4, 10, 10)
+    assert torch.equal(features.inputs, input_channels(observation, network.planes))
+    mean, most = features.pooled.chunk(2, 1)
+    whole = torch.cat((features.cells, features.inputs), 1)
+    assert whole.shape == (3, 4 + 4 + 6 + 7, 10, 10)
+    assert torch.allclose(mean, whole.mean((2, 3)), atol=1e-6)
+    assert torch.equal(most, whole.amax((2, 3)))
+    head = AGENT_KINDS["joint"].head(network)
+    assert torch.allclose(head(features), head.scores(whole).flatten(1), atol=1e-6)
+
+
+def test_a_network_computes_the_same_from_an_encoded_observation() -> None:
+    for agent, kind in AGENT_KINDS.items():
+        observation = observed(agent, Packing(3, seed=1), ALL_PLANES)
+        trunk = Trunk(kind.orientations, Network(planes=list(ALL_PLANES)))
+        features, again = trunk(observation), trunk(encode_observation(observation, ALL_PLANES))
+        assert torch.equal(features.cells, again.cells), agent
+        assert torch.equal(features.inputs, again.inputs), agent
 
 
 def test_feasible_cells_are_observed_relative_to_the_best_placement() -> None:

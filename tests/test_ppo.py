@@ -1,15 +1,17 @@
 """The trainer: two stock PPOs as one, against numbers worked by hand and against itself."""
 
 import json
+import warnings
 from pathlib import Path
 
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
-from small_runs import rollout, same, tiny, weights
+from small_runs import recorded_game, rollout, same, tiny, weights
 from tensordict import TensorDict
 from torch import Tensor
 
+from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import RunInterruptedError
 from marl_pack.agents.loading import Loader
@@ -44,9 +46,11 @@ def test_both_agents_store_the_same_reward_and_end_and_their_own_turn() -> None:
             first, second = (alg.learners[n].storage for n in ("orientation", "placement"))
             assert torch.equal(first.actions[step, :, 0].long(), o)
             assert torch.equal(second.actions[step, :, 0].long(), actions[:, 1])
-            assert torch.equal(first.observations["item"][step], items)
+            observed, sides = recorded_game(first.observations[step], game.size)
+            assert torch.equal(sides, items)
             for storage in (first, second):
-                assert torch.equal(storage.observations["heightmap"][step], heights)
+                observed, _ = recorded_game(storage.observations[step], game.size)
+                assert torch.equal(observed, heights)
             legal = mask[torch.arange(16), o]
             assert torch.equal(second.observations["mask"][step], legal.flatten(1))
             assert legal.flatten(1).gather(1, actions[:, 1:]).all()
@@ -90,10 +94,11 @@ def test_the_value_after_a_rollout_is_that_of_a_drawn_orientation_and_the_game_s
     drawn = runner.alg.learners["orientation"].actor.distribution
     assert drawn.log_probs.shape == (16, 6)
     items = before["items.sides"]
-    orientations = _orientations(last["item"], items)
+    _, item = recorded_game(last, runner.env.game.size)
+    orientations = _orientations(item, items)
     sides = items.gather(1, torch.tensor(ORIENTATIONS)[orientations])
-    assert torch.equal(sides, last["item"])
-    assert len(last["item"].unique(dim=0)) > 1
+    assert torch.equal(sides, item)
+    assert len(item.unique(dim=0)) > 1
     assert last["mask"].any(1).all(), "a drawn orientation is legal"
     assert (orientations > 0).any(), "not the first one always"
 
@@ -120,6 +125,30 @@ def test_learning_rate_and_entropy_follow_their_schedules() -> None:
         assert ppo.optimizer.param_groups[0]["lr"] == pytest.approx(rate)
         assert losses[f"{name}/learning_rate"] == pytest.approx(rate)
         assert ppo.entropy_coef == pytest.approx(0.006)
+
+
+def test_in_bfloat16_an_update_moves_the_weights_as_in_float32_but_not_exactly() -> None:
+    moves: dict[str, dict[str, Tensor]] = {}
+    for precision in ("float32", "bfloat16"):
+        with warnings.catch_warnings():  # some processors have no instructions for it
+            warnings.simplefilter("ignore")
+            runner = make_runner(tiny(f"--ppo.precision={precision}", "--ppo.optimizer=sgd"), None)
+        before = {name: weights(runner, name) for name in runner.alg.learners}
+        runner.train(1)
+        moves[precision] = {}
+        for name, old in before.items():
+            after = weights(runner, name)
+            moves[precision][name] = torch.cat([(after[key] - old[key]).flatten() for key in old])
+        checkpoint = runner.checkpoint()
+        assert checkpoint["config"]["ppo"]["precision"] == precision
+        played = Loader().agent_of(checkpoint["agents"]["placement"], "placement")
+        assert isinstance(played, LearnedAgent)
+        assert played.actor.cnns.precision == torch.float32
+    for name, move in moves["float32"].items():
+        other = moves["bfloat16"][name]
+        assert not torch.equal(move, other), name
+        assert torch.cosine_similarity(move, other, 0) > 0.99, name
+        assert float(other.norm() / move.norm()) == pytest.approx(1, abs=0.02), name
 
 
 def test_the_kl_that_is_reported_is_that_of_the_old_policy_to_the_new() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -43,6 +44,16 @@ def derived_seed(*parts: int) -> int:
     """Derive a seed from numbers; it is large, so it differs from the seeds that users choose."""
     low, high = np.random.SeedSequence(parts).generate_state(2, np.uint32)
     return int(high >> 1) << 32 | int(low)
+
+
+def fast_precision(precision: str, device: str) -> bool:
+    """Return whether the device has instructions for a precision (``ppo.precision``)."""
+    if precision == "float32":
+        return True
+    if torch.device(device).type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    supported: bool = torch.cpu._is_avx512_bf16_supported()
+    return supported
 
 
 def make_stream(config: Config) -> Stream:
@@ -120,6 +131,7 @@ def runner_settings(
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
     final_entropy, schedule = ppo.pop("final_entropy_coef"), ppo.pop("schedule")
+    precision = ppo.pop("precision")
     ppo.pop("num_envs")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
@@ -129,6 +141,7 @@ def runner_settings(
         last = final_entropy if agent.final_entropy_coef is None else agent.final_entropy_coef
         return {
             "network": asdict(agent.network),
+            "precision": precision,
             "algorithm": {**ppo, "learning_rate": rate, "entropy_coef": entropy},
             "teacher": teachers.get(name),
             "teacher_iterations": agent.teacher_iterations,
@@ -179,6 +192,13 @@ def make_runner(
     device = local_device(config)
     try:
         check_device(device)
+        precision = config.ppo.precision
+        if not fast_precision(precision, device):
+            warnings.warn(
+                f"ppo.precision = {precision}: this processor has no instructions for it "
+                "(AVX512-BF16 on CPUs), so it is probably slower than float32",
+                stacklevel=2,
+            )
         torch.manual_seed(config.seed)
         frozen, teachers = other_agents(config, checkpoint)
         settings = runner_settings(config, frozen, teachers)

@@ -26,7 +26,7 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning.cloning import Teacher
 from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
-from marl_pack.agents.networks.planes import encoded
+from marl_pack.agents.networks.planes import encode_observation
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.game.packing import Packing
 from marl_pack.vec_env import PackingVecEnv
@@ -321,8 +321,8 @@ class PackingPPO:
             env: the games.
             cfg: the configuration. ``algorithm`` has ``iterations``, ``lookahead``, ``frozen`` and
                 ``teachers`` (both: agents by name, callables as in :class:`Seat`). ``agents`` has
-                for each learner ``network``, ``algorithm`` (settings of rsl_rl's PPO),
-                ``schedule``, ``teacher_iterations`` and ``teacher_random``.
+                for each learner ``network``, ``precision``, ``algorithm`` (settings of rsl_rl's
+                PPO), ``schedule``, ``teacher_iterations`` and ``teacher_random``.
             device: the device of the networks.
         """
         algorithm = cfg["algorithm"]
@@ -361,7 +361,8 @@ class PackingPPO:
 def _encoded(observation: Observation, planes: Sequence[str]) -> TensorDict:
     """Return an observation of G games with its input channels, as rsl_rl stores it."""
     mask = observation["mask"]
-    return TensorDict(encoded(observation, planes), batch_size=[len(mask)], device=mask.device)
+    channels = encode_observation(observation, planes)
+    return TensorDict(channels, batch_size=[len(mask)], device=mask.device)
 
 
 def _stock_ppo(
@@ -381,7 +382,7 @@ def _stock_ppo(
             "share_cnn_encoders": True,
             **settings["algorithm"],
         },
-        "actor": {"class_name": Actor, **model},
+        "actor": {"class_name": Actor, **model, "precision": settings["precision"]},
         "critic": {"class_name": Critic, **model},
         "obs_groups": {"actor": list(obs.keys()), "critic": list(obs.keys())},
         "num_steps_per_env": cfg["num_steps_per_env"],

@@ -66,7 +66,9 @@ def checked_optimizer(
         if real_number(group.get("lr"), f"{name}.lr") < 0:
             raise ValueError(f"{name}.lr = {group['lr']}: needs 0 or more")
         for key, value in group.items():
-            if key not in ("lr", *WAYS_TO_COMPUTE) and (key not in needed or not _equal(value, needed[key])):
+            if key not in ("lr", *WAYS_TO_COMPUTE) and (
+                key not in needed or not _equal(value, needed[key])
+            ):
                 needs = shown(needed[key]) if key in needed else "none"
                 raise ValueError(f"{name}.{key}: is {shown(value)}, needs {needs}")
         groups.append(needed | {"lr": group["lr"]})

@@ -26,6 +26,7 @@ class Actor(MLPModel):
         output_dim: as rsl_rl passes it; not used, as ``agent`` decides the number of outputs.
         agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
         network: fields of :class:`marl_pack.agents.networks.shape.Network`.
+        precision: name of the type of the numbers in the trunk, as for ``ppo.precision``.
     """
 
     def __init__(
@@ -37,11 +38,12 @@ class Actor(MLPModel):
         *,
         agent: str,
         network: Mapping[str, Any],
+        precision: str = "float32",
     ) -> None:
         nn.Module.__init__(self)  # MLPModel.__init__ builds a perceptron for flat observations
         shape, kind = Network(**network), AGENT_KINDS[agent]
         self.obs_groups, self.obs_normalization = obs_groups[obs_set], False
-        self.cnns = Trunk(kind.orientations, shape)
+        self.cnns = Trunk(kind.orientations, shape, getattr(torch, precision))
         self.mlp = kind.head(shape)
         self.distribution = MaskedCategorical(1)
 

@@ -44,8 +44,9 @@ class ScoreMap(nn.Module):
     def forward(self, features: Features) -> Tensor:
         """Return scores in the order of the actions: orientation, x, y."""
         # Matrix products are several times faster than a convolution of so few outputs.
-        weight, channels = self.scores.weight.flatten(1), features.cells.shape[1]
-        scores = linear(by_cell(features.cells), weight[:, :channels], self.scores.bias)
+        filters, bias = self.scores.parameters()
+        weight, channels = filters.flatten(1), features.cells.shape[1]
+        scores = linear(by_cell(features.cells).float(), weight[:, :channels], bias)
         if features.inputs is not None:
             scores = scores + linear(by_cell(features.inputs), weight[:, channels:])
         return scores.transpose(1, 2).flatten(1)

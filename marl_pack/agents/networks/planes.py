@@ -262,10 +262,10 @@ def need_critic(planes: Iterable[str]) -> bool:
 
 
 ENCODED = "input_channels"
-"""The tensor float32 [G, W, D, C] of an encoded observation (:func:`encoded`)."""
+"""The tensor float32 [G, W, D, C] of an encoded observation (:func:`encode_observation`)."""
 
 
-def encoded(observation: Observation, planes: Sequence[str]) -> dict[str, Tensor]:
+def encode_observation(observation: Observation, planes: Sequence[str]) -> dict[str, Tensor]:
     """Return the observation with its input channels in place of the tensors they are made of.
 
     A network computes the same from both. What is observed often is so encoded only once.
@@ -282,7 +282,8 @@ def input_channels(observation: Observation, planes: Sequence[str]) -> Tensor:
 
     Args:
         observation: ``heightmap`` int [G, W, D], ``item`` int [G, 3], ``height`` int [G, 1] (H),
-            and the tensors of the planes; or these, :func:`encoded`.
+            and the tensors of the planes; or an encoded
+            observation.
         planes: names in :data:`PLANES`.
 
     Returns:

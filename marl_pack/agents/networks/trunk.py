@@ -30,18 +30,18 @@ def by_cell(features: Tensor) -> Tensor:
 
 
 def pool(features: Tensor) -> Tensor:
-    """Pool features [B, C, W, D] to their mean and maximum over the cells, [B, 2C]."""
+    """Pool features [B, C, W, D] to their mean and maximum over the cells, float32 [B, 2C]."""
     # The backward pass of mean((2, 3)) is not channels last, and that of amax takes four times as
     # long as that of adaptive_max_pool2d, which computes the same.
-    most = nn.functional.adaptive_max_pool2d(features, 1).flatten(1)
-    return torch.cat((by_cell(features).mean(1), most), 1)
+    most = nn.functional.adaptive_max_pool2d(features, 1).flatten(1).float()
+    return torch.cat((by_cell(features).mean(1, dtype=torch.float32), most), 1)
 
 
 class Features:
     """The output of a trunk: features of every cell, and the input channels themselves.
 
     Args:
-        cells: features, float32 [B, C, W, D].
+        cells: features [B, C, W, D], in the precision of the convolutions.
         inputs: input channels, float32 [B, P, W, D]; None if the heads do not see them.
     """
 
@@ -64,10 +64,15 @@ class Trunk(nn.Module):
     Args:
         orientations: A, how many orientations the agent judges.
         network: the shape of the network.
+        precision: the type of the numbers in convolutions and features, float32 or bfloat16.
+            Weights, inputs and heads are float32.
     """
 
-    def __init__(self, orientations: int, network: Network) -> None:
+    def __init__(
+        self, orientations: int, network: Network, precision: torch.dtype = torch.float32
+    ) -> None:
         super().__init__()
+        self.precision = precision
         self.planes, self.residual = list(network.planes), network.residual
         self.shortcut = network.shortcut
         channels = network.channels
@@ -82,12 +87,14 @@ class Trunk(nn.Module):
 
     def forward(self, observation: Observation) -> Features:
         """Compute the features of every cell."""
-        x = inputs = input_channels(observation, self.planes)
+        inputs = input_channels(observation, self.planes)
+        x = inputs.to(self.precision)
         for k, convolution in enumerate(self.convolutions):
-            y = torch.relu_(convolution(x))
+            weight, bias = (values.to(x.dtype) for values in convolution.parameters())
+            y = torch.relu_(nn.functional.conv2d(x, weight, bias, padding=1))
             x = x + y if self.residual and k else y
             if k == 0 and self.context is not None:
-                x = x + self.context(pool(x))[:, :, None, None]
+                x = x + self.context(pool(x)).to(x.dtype)[:, :, None, None]
         return Features(x, inputs if self.shortcut else None)
 
     def store(self, observation: Observation) -> Features:
