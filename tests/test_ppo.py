@@ -303,6 +303,9 @@ def test_a_resumed_run_gives_the_weights_of_one_never_stopped(
         part.train(5)
     torch.manual_seed(12345)
     latest = checkpoints.read(tmp_path / "part" / "latest.pt")
+    for record in latest["agents"].values():  # as versions without fused optimisers wrote it
+        if "optimizer_state_dict" in record:
+            record["optimizer_state_dict"]["param_groups"][0]["fused"] = None
     resumed = make_runner(config, tmp_path / "part", latest)
     assert resumed.current_learning_iteration == 2
     resumed.train(5)
