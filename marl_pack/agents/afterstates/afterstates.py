@@ -122,19 +122,21 @@ def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[in
 
 
 @njit(cache=True, nogil=True)
-def _placements(mask: Any, sides: Any, index: Any) -> Any:
-    """List bin, orientation, x and y of every legal placement; equal placements are listed once.
+def _placements(mask: Any, sides: Any, heightmap: Any, index: Any) -> tuple[Any, Any]:
+    """List the legal placements; equal placements are listed once.
 
     Args:
         mask: bool [N, A, W, D].
         sides: int16 [N, A, 3].
+        heightmap: int16 [N, W, D].
         index: int64 [N, A, W, D], written where the mask is true: each placement's row.
 
     Returns:
-        int64 [K, 4].
+        The placements int64 [K, 7], each as bin, x, y, w, d, h and resting height, and the empty
+        cells int64 [K] that each box would enclose.
     """
     n, count, width, depth = mask.shape
-    placements = np.empty((mask.size, 4), np.int64)
+    placements, waste = np.empty((mask.size, 7), np.int64), np.empty(mask.size, np.int64)
     k = 0
     for b in range(n):
         for a in range(count):
@@ -146,6 +148,7 @@ def _placements(mask: Any, sides: Any, index: Any) -> Any:
                     and sides[b, a, 2] == sides[b, e, 2]
                 ):
                     equal = e
+            w, d, h = np.int64(sides[b, a, 0]), np.int64(sides[b, a, 1]), np.int64(sides[b, a, 2])
             for x in range(width):
                 for y in range(depth):
                     if not mask[b, a, x, y]:
@@ -153,60 +156,90 @@ def _placements(mask: Any, sides: Any, index: Any) -> Any:
                     if equal < a and mask[b, equal, x, y]:
                         index[b, a, x, y] = index[b, equal, x, y]
                         continue
+                    z, below = np.int64(0), np.int64(0)
+                    for i in range(x, x + w):
+                        for j in range(y, y + d):
+                            z = max(z, np.int64(heightmap[b, i, j]))
+                            below += heightmap[b, i, j]
                     row = placements[k]
-                    row[0], row[1], row[2], row[3] = b, a, x, y
+                    row[0], row[1], row[2], row[3], row[4], row[5], row[6] = b, x, y, w, d, h, z
+                    waste[k] = w * d * z - below
                     index[b, a, x, y] = k
                     k += 1
-    return placements[:k]
+    return placements[:k], waste[:k]
+
+
+@njit(cache=True, inline="always")
+def _step(tenths: Any, one: int, other: int) -> Any:
+    """Return the entry of :attr:`Afterstates.surface` for the step between two heights."""
+    return SHARES + 1 + min(tenths[abs(one - other)], STEPS - 1)
+
+
+@njit(cache=True)
+def _tally(
+    heightmap: Any, x: int, y: int, w: int, d: int, tenths: Any, change: int, tally: Any
+) -> None:
+    """Add ``change`` to the entry of every column in a window and of every step at such a column.
+
+    Args:
+        heightmap: int16 [W, D].
+        x, y, w, d: low corner and size of the window.
+        tenths: int64 [H + 1], the class of each height.
+        change: the number to add.
+        tally: int64 [17], changed: how often each entry of :attr:`Afterstates.surface` occurs.
+    """
+    width, depth = heightmap.shape
+    for i in range(x, min(x + w + 1, width)):
+        for j in range(y, min(y + d + 1, depth)):
+            level = heightmap[i, j]
+            if i < x + w and j < y + d:
+                tally[tenths[level]] += change
+            if i and j < y + d:
+                tally[_step(tenths, level, heightmap[i - 1, j])] += change
+            if j and i < x + w:
+                tally[_step(tenths, level, heightmap[i, j - 1])] += change
 
 
 @njit(cache=True, nogil=True)
-def _place_each(
-    heightmap: Any, empty_map: Any, sides: Any, placements: Any, heightmaps: Any, empty_maps: Any,
-    waste: Any,
-) -> None:  # fmt: skip
-    """Write the maps after each placement and the wasted cells.
+def _write_surfaces(heightmap: Any, placements: Any, height: int, surface: Any) -> None:
+    """Write the surface after each placement as in :class:`Afterstates`.
 
     Args:
         heightmap: int16 [N, W, D].
-        empty_map: int16 [N, W, D].
-        sides: int16 [N, A, 3].
-        placements: int64 [K, 4], bin, orientation, x and y.
-        heightmaps: int16 [K, W, D], written.
-        empty_maps: int16 [K, W, D], written.
-        waste: int64 [K], written.
+        placements: int64 [K, 7], see :func:`_placements`.
+        height: H.
+        surface: float32 [K, 17], written.
     """
     width, depth = heightmap.shape[1:]
-    for k in range(placements.shape[0]):
-        b, a, x, y = placements[k, 0], placements[k, 1], placements[k, 2], placements[k, 3]
-        for i in range(width):
-            for j in range(depth):
-                heightmaps[k, i, j], empty_maps[k, i, j] = heightmap[b, i, j], empty_map[b, i, j]
-        w, d, h = sides[b, a, 0], sides[b, a, 1], sides[b, a, 2]
-        _, waste[k] = place_box(heightmaps[k], empty_maps[k], x, y, w, d, h)
-
-
-@njit(cache=True, nogil=True)
-def _write_surfaces(heightmaps: Any, height: int, surface: Any) -> None:
-    """Write the surface of maps int16 [K, W, D] as in :class:`Afterstates`."""
-    width, depth = heightmaps.shape[1:]
     columns = np.float32(width * depth)
     pairs = np.float32(max(1, (width - 1) * depth + width * (depth - 1)))
     tenths = np.arange(height + 1) * SHARES // height
-    for k in range(heightmaps.shape[0]):
-        surface[k] = 0
-        for i in range(width):
-            for j in range(depth):
-                level = heightmaps[k, i, j]
-                surface[k, tenths[level]] += 1
-                if i:
-                    step = tenths[abs(level - heightmaps[k, i - 1, j])]
-                    surface[k, SHARES + 1 + min(step, STEPS - 1)] += 1
-                if j:
-                    step = tenths[abs(level - heightmaps[k, i, j - 1])]
-                    surface[k, SHARES + 1 + min(step, STEPS - 1)] += 1
-        surface[k, : SHARES + 1] /= columns
-        surface[k, SHARES + 1 :] /= pairs
+    bare, tally = np.empty(SURFACE, np.int64), np.empty(SURFACE, np.int64)
+    last = -1
+    for k in range(len(placements)):
+        b, x, y, w, d, h, z = placements[k]
+        if b != last:
+            last = b
+            bare[:] = 0
+            _tally(heightmap[b], 0, 0, width, depth, tenths, 1, bare)
+        tally[:] = bare
+        # The box replaces the columns of its window, and levels the steps between them.
+        _tally(heightmap[b], x, y, w, d, tenths, -1, tally)
+        tally[tenths[z + h]] += w * d
+        tally[SHARES + 1] += (w - 1) * d + w * (d - 1)
+        for i in range(x, x + w):
+            if y:
+                tally[_step(tenths, z + h, heightmap[b, i, y - 1])] += 1
+            if y + d < depth:
+                tally[_step(tenths, z + h, heightmap[b, i, y + d])] += 1
+        for j in range(y, y + d):
+            if x:
+                tally[_step(tenths, z + h, heightmap[b, x - 1, j])] += 1
+            if x + w < width:
+                tally[_step(tenths, z + h, heightmap[b, x + w, j])] += 1
+        for entry in range(SURFACE):
+            total = columns if entry <= SHARES else pairs
+            surface[k, entry] = np.float32(tally[entry]) / total
 
 
 @njit(cache=True, nogil=True)
@@ -230,26 +263,48 @@ def _count(masks: Any, best_level: Any, lengths: Any, fitting: Any, counts: Any)
                         counts[k, p // lengths.size, p % lengths.size, tall] += 1
 
 
-def count_by_masks(
-    heightmaps: Any, empty_maps: Any, lengths: Any, fitting: Any, counts: Any
+@njit(cache=True, nogil=True)
+def _place_each(
+    heightmap: Any, empty_map: Any, placements: Any, heightmaps: Any, empty_maps: Any
 ) -> None:
-    """Count the cells where each box could be placed on each pair of maps, from masks.
+    """Write the maps after each placement.
 
     Args:
-        heightmaps: int16 [K, W, D].
-        empty_maps: int16 [K, W, D].
+        heightmap: int16 [N, W, D].
+        empty_map: int16 [N, W, D].
+        placements: int64 [K, 7], see :func:`_placements`.
+        heightmaps: int16 [K, W, D], written.
+        empty_maps: int16 [K, W, D], written.
+    """
+    for k in range(len(placements)):
+        b, x, y, w, d, h, _ = placements[k]
+        heightmaps[k], empty_maps[k] = heightmap[b], empty_map[b]
+        place_box(heightmaps[k], empty_maps[k], x, y, w, d, h)
+
+
+def count_by_masks(
+    heightmap: Any, empty_map: Any, placements: Any, lengths: Any, fitting: Any, counts: Any
+) -> None:
+    """Count the cells where each box could be placed after each placement, from masks.
+
+    Args:
+        heightmap: int16 [N, W, D].
+        empty_map: int16 [N, W, D].
+        placements: int64 [K, 7], see :func:`_placements`.
         lengths: int64 [L], ascending.
         fitting: int64 [H + 1], how many of the lengths fit between each level and the bin's top.
         counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
     """
-    n, *shape = heightmaps.shape
+    n, shape = len(placements), heightmap.shape[1:]
     height = fitting.size - 1
+    maps = np.empty((2, n, *shape), np.int16)
+    _place_each(heightmap, empty_map, placements, *maps)
     footprints = [(w, d, lengths[0]) for w, d in product(lengths.tolist(), repeat=2)]
     masks = np.empty((n, len(footprints), *shape), np.uint8)
     levels = np.empty((n, *shape), hull_compiled.level_dtype(height))
     best_level = np.empty(masks.shape, levels.dtype)
     boxes = np.tile(np.array(footprints, np.int16), (n, 1, 1))
-    hull_compiled.central_masks(heightmaps, empty_maps, boxes, height, levels, masks, best_level)
+    hull_compiled.central_masks(*maps, boxes, height, levels, masks, best_level)
     flat = n, len(footprints), -1
     _count(masks.reshape(flat), best_level.reshape(flat), lengths, fitting, counts)
 
@@ -277,11 +332,11 @@ def afterstates_by_compiled_loops(
     boxes, legal = np.ascontiguousarray(sides.numpy()), np.ascontiguousarray(mask.numpy())
     heightmap, empty_map = bins.heightmap.numpy(), bins.empty_map.numpy()
     index = np.zeros(mask.shape, np.int64)
-    placements = _placements(legal, boxes, index)
+    placements, waste = _placements(legal, boxes, heightmap, index)
     count, probes, shape = len(placements), np.array(lengths), bins.size[:2]
     fitting = (probes <= bins.height - np.arange(bins.height + 1)[:, None]).sum(1)
     counts = np.empty((count, *[len(lengths)] * 3), np.int32)
-    surface, waste = np.empty((count, SURFACE), np.float32), np.empty(count, np.int64)
+    surface = np.empty((count, SURFACE), np.float32)
     by_bits = bitboards.fit_in_words(*shape)
     if count_cells is None:
         count_cells = bitboards.count_by_bits if by_bits else count_by_masks
@@ -291,14 +346,12 @@ def afterstates_by_compiled_loops(
 
     def compute(start: int) -> None:
         part = slice(start, start + most)
-        maps = np.empty((2, len(placements[part]), *shape), np.int16)
-        _place_each(heightmap, empty_map, boxes, placements[part], maps[0], maps[1], waste[part])
-        _write_surfaces(maps[0], bins.height, surface[part])
-        count_cells(maps[0], maps[1], probes, fitting, counts[part])
+        _write_surfaces(heightmap, placements[part], bins.height, surface[part])
+        count_cells(heightmap, empty_map, placements[part], probes, fitting, counts[part])
 
     starts = range(0, count, most)
     list(map(compute, starts) if threads == 1 else _workers(threads).map(compute, starts))
-    volume = torch.from_numpy(boxes[placements[:, 0], placements[:, 1]].prod(1, dtype=np.int64))
+    volume = torch.from_numpy(placements[:, 3:6].prod(1))
     return Afterstates(
         torch.from_numpy(index), torch.from_numpy(counts), torch.from_numpy(surface), volume,
         torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume, bins.backend,

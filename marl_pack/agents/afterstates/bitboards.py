@@ -6,6 +6,12 @@ set. The quadrant test of ``hull_alpha`` (:mod:`marl_pack.stability.hull_compile
 on sets, level by level. A window without a higher cell is feasible if each quadrant around its
 middle contains a bearing cell of the level. If only each half contains a bearing cell, the exact
 test decides. Corners whose windows reach over the end of a row are left out.
+
+The feasible windows of a bin are found once. A box whose top is at level T then changes little:
+
+- windows on levels above T stay as they are: the box is below them;
+- windows on levels below T stay feasible unless they contain a cell of the box;
+- windows on level T stay feasible too, and those that contain a cell of the box are tested again.
 """
 
 from __future__ import annotations
@@ -47,47 +53,39 @@ def _count_bits(word: Any) -> int:
     return int((word * uint64(0x0101010101010101)) >> uint64(56))
 
 
-@njit(cache=True)
-def _window(depth: int, x: int, y: int, w: int, d: int) -> tuple[Any, Any]:
-    """Return the set of the cells from (x, y) to (x + w - 1, y + d - 1)."""
-    low, high = uint64(0), uint64(0)
-    for i in range(x, x + w):
-        for j in range(y, y + d):
-            bit = i * depth + j
-            if bit < 64:
-                low |= uint64(1) << uint64(bit)
-            else:
-                high |= uint64(1) << uint64(bit - 64)
+@njit(cache=True, inline="always")
+def _widen(low: Any, high: Any, size: int, wanted: int, stride: int) -> tuple[Any, Any]:
+    """Unite a set shifted by 0 … ``size`` - 1 strides with its shifts by up to ``wanted`` - 1."""
+    while size < wanted:
+        step = min(size, wanted - size)
+        more_low, more_high = _shift(low, high, step * stride)
+        low, high = low | more_low, high | more_high
+        size += step
     return low, high
 
 
-@njit(cache=True, inline="always")
-def _grow(source: Any, first: int, end: int, stride: int, grown: Any) -> None:
-    """Unite ``grown`` [2] with ``source`` [2] shifted by ``first`` … ``end`` - 1 strides."""
-    for step in range(first, end):
-        low, high = _shift(source[0], source[1], step * stride)
-        grown[0] |= low
-        grown[1] |= high
-
-
 @njit(cache=True)
-def _corners(cells: Any, depth: int, spare: Any, boards: Any) -> None:
-    """Find the low corners of windows of each size up to R × S that contain one of ``cells``.
+def _corners(low: Any, high: Any, widths: Any, depths: Any, depth: int, corners: Any) -> None:
+    """Find the low corners of windows of each size that contain one of the cells of a set.
 
     Args:
-        cells: uint64 [2], a set.
+        low, high: the set.
+        widths, depths: int64 [I] and int64 [J], ascending: the sides of the windows.
         depth: D.
-        spare: uint64 [2], scratch.
-        boards: uint64 [R + 1, S + 1, 2], written from [1, 1] on: the corners for each size.
+        corners: uint64 [2, I · J], written.
     """
-    spare[0], spare[1] = cells[0], cells[1]
-    for d in range(1, boards.shape[1]):
-        _grow(cells, d - 1, d, 1, spare)
-        boards[1, d, 0], boards[1, d, 1] = spare[0], spare[1]
-    for w in range(2, boards.shape[0]):
-        for d in range(1, boards.shape[1]):
-            boards[w, d, 0], boards[w, d, 1] = boards[w - 1, d, 0], boards[w - 1, d, 1]
-            _grow(boards[1, d], w - 1, w, depth, boards[w, d])
+    size = 1
+    for j in range(depths.size):
+        low, high = _widen(low, high, size, depths[j], 1)
+        size = depths[j]
+        corners[0, j], corners[1, j] = low, high
+    for i in range(widths.size):
+        size = widths[i - 1] if i else 1
+        for j in range(depths.size):
+            p, before = i * depths.size + j, max(0, i - 1) * depths.size + j
+            corners[0, p], corners[1, p] = _widen(
+                corners[0, before], corners[1, before], size, widths[i], depth
+            )
 
 
 @njit(cache=True, inline="always")
@@ -133,51 +131,62 @@ def _rises(w: int, d: int, rises: Any) -> None:
 
 
 @njit(cache=True)
-def _exact(cells: Any, corners: Any, depth: int, w: int, d: int, rises: Any) -> tuple[Any, Any]:
-    """Return the ``corners`` [2] of windows whose middle is inside the hull of ``cells``."""
+def _exact(
+    low: Any, high: Any, open_low: Any, open_high: Any, depth: int, w: int, d: int, rises: Any
+) -> tuple[Any, Any]:
+    """Return the open corners of windows whose middle is inside the hull of their cells.
+
+    Args:
+        low, high: the cells.
+        open_low, open_high: the corners of the windows to test.
+        depth: D.
+        w, d: size of the windows.
+        rises: float64 [w, d, 2], see :func:`_rises`.
+    """
     inside_low, inside_high = uint64(0), uint64(0)
     row = ~uint64(0) >> uint64(64 - d)
-    for word in range(2):
-        remaining = corners[word]
-        while remaining:
-            lowest = remaining & (~remaining + uint64(1))
-            remaining ^= lowest
-            corner = 64 * word + _count_bits(lowest - uint64(1))
-            up_left, up_right, down_left, down_right = -np.inf, -np.inf, -np.inf, -np.inf
-            for x in range(w):
-                bits = _shift(cells[0], cells[1], corner + x * depth)[0] & row
-                if bits:
-                    top, bottom = _highest_bit(bits), d - 1 - _lowest_bit(bits)
-                    up_left = max(up_left, rises[x, top, 0])
-                    up_right = max(up_right, rises[x, top, 1])
-                    down_left = max(down_left, rises[x, bottom, 0])
-                    down_right = max(down_right, rises[x, bottom, 1])
-            # Rises are fractions of whole numbers up to 128: a sum that is not 0 is far from 0.
-            if up_left + up_right > 1e-6 and down_left + down_right > 1e-6:
-                if word == 0:
-                    inside_low |= lowest
-                else:
-                    inside_high |= lowest
+    while open_low | open_high:
+        word = 0 if open_low else 64
+        remaining = open_low if open_low else open_high
+        corner, lowest = word + _lowest_bit(remaining), remaining & (~remaining + uint64(1))
+        up_left, up_right, down_left, down_right = -np.inf, -np.inf, -np.inf, -np.inf
+        for x in range(w):
+            bits = _shift(low, high, corner + x * depth)[0] & row
+            if bits:
+                top, bottom = _highest_bit(bits), d - 1 - _lowest_bit(bits)
+                up_left = max(up_left, rises[x, top, 0])
+                up_right = max(up_right, rises[x, top, 1])
+                down_left = max(down_left, rises[x, bottom, 0])
+                down_right = max(down_right, rises[x, bottom, 1])
+        # Rises are fractions of whole numbers up to 128: a sum that is not 0 is far from 0.
+        inside = up_left + up_right > 1e-6 and down_left + down_right > 1e-6
+        if open_low:
+            open_low ^= lowest
+            inside_low |= lowest if inside else uint64(0)
+        else:
+            open_high ^= lowest
+            inside_high |= lowest if inside else uint64(0)
     return inside_low, inside_high
 
 
 @njit(cache=True)
-def _window_tables(lengths: Any, width: int, depth: int) -> tuple[Any, Any]:
-    """Build the tables that depend only on a window's size, for lengths up to the floor's sides.
+def _strips(width: int, depth: int) -> tuple[Any, Any]:
+    """Return the sets of the cells from row a to row b - 1, and from column a to column b - 1.
 
     Returns:
-        The corners of the windows that lie on the floor, uint64 [I, J, 2], and the rises in them
-        (:func:`_rises`), float64 [I, J, W, D, 2].
+        uint64 [W + 1, W + 1, 2] and uint64 [D + 1, D + 1, 2], by a and b.
     """
-    fit_w, fit_d = int((lengths <= width).sum()), int((lengths <= depth).sum())
-    valid = np.zeros((fit_w, fit_d, 2), np.uint64)
-    rises = np.empty((fit_w, fit_d, width, depth, 2))
-    for i in range(fit_w):
-        for j in range(fit_d):
-            across, along = width - lengths[i] + 1, depth - lengths[j] + 1
-            valid[i, j, 0], valid[i, j, 1] = _window(depth, 0, 0, across, along)
-            _rises(lengths[i], lengths[j], rises[i, j])
-    return valid, rises
+    rows = np.zeros((width + 1, width + 1, 2), np.uint64)
+    columns = np.zeros((depth + 1, depth + 1, 2), np.uint64)
+    for cell in range(width * depth):
+        x, y, one = cell // depth, cell % depth, uint64(1) << uint64(cell & 63)
+        for a in range(x + 1):
+            for b in range(x + 1, width + 1):
+                rows[a, b, cell >> 6] |= one
+        for a in range(y + 1):
+            for b in range(y + 1, depth + 1):
+                columns[a, b, cell >> 6] |= one
+    return rows, columns
 
 
 @njit(cache=True)
@@ -206,62 +215,155 @@ def _decide_word(free: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
     return yes, free & ~yes & (a | b) & (c | d) & (a | c) & (b | d)
 
 
+@njit(cache=True)
+def _test(
+    candidates: Any, low: Any, high: Any, widths: Any, depths: Any, depth: int, rises: Any,
+    quarters: Any, feasible: Any,
+) -> None:  # fmt: skip
+    """Find the feasible windows of each size on one level.
+
+    Args:
+        candidates: uint64 [2, I · J], the corners of the windows to test, without higher cells.
+        low, high: the bearing cells of the level.
+        widths, depths: int64 [I] and int64 [J], ascending: the sides of the windows.
+        depth: D.
+        rises: float64 [I, J, W, D, 2], see :func:`_rises`.
+        quarters: uint64 [2, I · J], scratch.
+        feasible: uint64 [2, I · J], written: those of ``candidates`` that are feasible.
+    """
+    _corners(low, high, (widths + 1) // 2, (depths + 1) // 2, depth, quarters)
+    for i in range(widths.size):
+        across = widths[i] // 2 * depth
+        for j in range(depths.size):
+            p, along = i * depths.size + j, depths[j] // 2
+            feasible[0, p], feasible[1, p] = uint64(0), uint64(0)
+            if not (candidates[0, p] | candidates[1, p]):
+                continue
+            a_low, a_high = quarters[0, p], quarters[1, p]
+            b_low, b_high = _shift(a_low, a_high, along)
+            c_low, c_high = _shift(a_low, a_high, across)
+            d_low, d_high = _shift(a_low, a_high, across + along)
+            yes_low, open_low = _decide_word(candidates[0, p], a_low, b_low, c_low, d_low)
+            yes_high, open_high = _decide_word(candidates[1, p], a_high, b_high, c_high, d_high)
+            if open_low | open_high:
+                more_low, more_high = _exact(
+                    low, high, open_low, open_high, depth, widths[i], depths[j], rises[i, j]
+                )
+                yes_low, yes_high = yes_low | more_low, yes_high | more_high
+            feasible[0, p], feasible[1, p] = yes_low, yes_high
+
+
+@njit(cache=True)
+def _survey(
+    levels: Any, fitting: Any, inside: Any, widths: Any, depths: Any, depth: int, rises: Any,
+    quarters: Any, heights: Any, bearing: Any, free: Any, feasible: Any, number: Any,
+) -> int:  # fmt: skip
+    """Find the feasible windows of a bin on each level that has cells, from the highest level on.
+
+    Args:
+        levels: uint64 [H + 1, 2, 2], see :func:`_levels`.
+        fitting: int64 [H + 1], how many of the lengths fit between each level and the bin's top.
+        inside: uint64 [2, I · J], the corners of the windows that lie on the floor.
+        widths, depths, depth, rises, quarters: as for :func:`_test`.
+        heights: int64 [S], written: the levels.
+        bearing: uint64 [S, 2], written: the bearing cells of each level.
+        free: uint64 [S, 2, I · J], written: the corners of the windows without a higher cell.
+        feasible: uint64 [S, 2, I · J], written: those that are feasible.
+        number: int64 [S, I · J], written: how many are feasible.
+
+    Returns:
+        The number of levels.
+    """
+    above_low, above_high, s = uint64(0), uint64(0), 0
+    for level in range(len(levels) - 1, -1, -1):
+        if not (levels[level, 1, 0] | levels[level, 1, 1]):
+            continue
+        heights[s] = level
+        bearing[s, 0], bearing[s, 1] = levels[level, 0, 0], levels[level, 0, 1]
+        _corners(above_low, above_high, widths, depths, depth, quarters)
+        for word in range(2):
+            for p in range(inside.shape[1]):
+                free[s, word, p] = inside[word, p] & ~quarters[word, p]
+        if fitting[level]:
+            _test(
+                free[s], bearing[s, 0], bearing[s, 1], widths, depths, depth, rises, quarters,
+                feasible[s],
+            )  # fmt: skip
+        else:
+            feasible[s] = uint64(0)
+        for p in range(inside.shape[1]):
+            number[s, p] = _count_bits(feasible[s, 0, p]) + _count_bits(feasible[s, 1, p])
+        above_low, above_high = above_low | levels[level, 1, 0], above_high | levels[level, 1, 1]
+        s += 1
+    return s
+
+
 @njit(cache=True, nogil=True)
 def count_by_bits(
-    heightmaps: Any, empty_maps: Any, lengths: Any, fitting: Any, counts: Any
+    heightmap: Any, empty_map: Any, placements: Any, lengths: Any, fitting: Any, counts: Any
 ) -> None:
     """Count feasible cells as ``count_by_masks`` does, where :func:`fit_in_words` is true."""
-    (width, depth), most = heightmaps.shape[1:], fitting.size
-    valid, rises = _window_tables(lengths, width, depth)
-    fit_w, fit_d = valid.shape[:2]
-    reach_w = (lengths[fit_w - 1] + 1) // 2 if fit_w else 0
-    reach_d = (lengths[fit_d - 1] + 1) // 2 if fit_d else 0
-    levels = np.empty((most, 2, 2), np.uint64)  # of each level: bearing cells, all cells
-    quarters = np.empty((reach_w + 1, reach_d + 1, 2), np.uint64)
-    above, undecided = np.empty(2, np.uint64), np.empty(2, np.uint64)
-    deep = np.empty((fit_d, 2), np.uint64)  # corners of windows whose first row has a higher cell
-    blocked = np.empty((fit_d, 2), np.uint64)  # corners of windows with a higher cell
-    for k in range(heightmaps.shape[0]):
-        _levels(heightmaps[k], empty_maps[k], levels)
-        counts[k] = 0
-        above[:] = uint64(0)
-        for level in range(most - 1, -1, -1):
-            fit = fitting[level]
-            if fit and fit_w and fit_d and (levels[level, 0, 0] | levels[level, 0, 1]):
-                _corners(levels[level, 0], depth, undecided, quarters)
-                deep[0] = above
-                for j in range(fit_d):
-                    if j:
-                        deep[j] = deep[j - 1]
-                    _grow(above, lengths[j - 1] if j else 1, lengths[j], 1, deep[j])
-                    blocked[j] = deep[j]
-                last = fit_d
-                for i in range(fit_w):
-                    half_w = (lengths[i] + 1) // 2
-                    across = (lengths[i] - half_w) * depth
-                    for j in range(last):
-                        _grow(deep[j], lengths[i - 1] if i else 1, lengths[i], depth, blocked[j])
-                        free_low = valid[i, j, 0] & ~blocked[j, 0]
-                        free_high = valid[i, j, 1] & ~blocked[j, 1]
-                        if not (free_low | free_high):
-                            last = j  # longer windows are not free on this level either
-                            break
-                        half_d = (lengths[j] + 1) // 2
-                        along = lengths[j] - half_d
-                        a_low, a_high = quarters[half_w, half_d]
-                        b_low, b_high = _shift(a_low, a_high, along)
-                        c_low, c_high = _shift(a_low, a_high, across)
-                        d_low, d_high = _shift(a_low, a_high, across + along)
-                        low, undecided[0] = _decide_word(free_low, a_low, b_low, c_low, d_low)
-                        high, undecided[1] = _decide_word(free_high, a_high, b_high, c_high, d_high)
-                        if undecided[0] | undecided[1]:
-                            more_low, more_high = _exact(
-                                levels[level, 0], undecided, depth, lengths[i], lengths[j],
-                                rises[i, j],
-                            )  # fmt: skip
-                            low, high = low | more_low, high | more_high
-                        feasible = _count_bits(low) + _count_bits(high)
-                        for tall in range(fit if feasible else 0):
-                            counts[k, i, j, tall] += feasible
-            above[0] |= levels[level, 1, 0]
-            above[1] |= levels[level, 1, 1]
+    (width, depth), most = heightmap.shape[1:], min(fitting.size, heightmap[0].size)
+    widths, depths = lengths[lengths <= width], lengths[lengths <= depth]
+    sizes = widths.size * depths.size
+    rows, columns = _strips(width, depth)
+    inside = np.empty((2, sizes), np.uint64)
+    rises = np.empty((widths.size, depths.size, width, depth, 2))
+    for i in range(widths.size):
+        for j in range(depths.size):
+            wide, deep = rows[0, width - widths[i] + 1], columns[0, depth - depths[j] + 1]
+            inside[0, i * depths.size + j] = wide[0] & deep[0]
+            inside[1, i * depths.size + j] = wide[1] & deep[1]
+            _rises(widths[i], depths[j], rises[i, j])
+    levels = np.empty((fitting.size, 2, 2), np.uint64)
+    heights, bearing = np.empty(most, np.int64), np.empty((most, 2), np.uint64)
+    free, feasible = np.empty((most, 2, sizes), np.uint64), np.empty((most, 2, sizes), np.uint64)
+    number = np.empty((most, sizes), np.int64)
+    quarters, touched = np.empty((2, sizes), np.uint64), np.empty((2, sizes), np.uint64)
+    candidates, tested = np.empty((2, sizes), np.uint64), np.empty((2, sizes), np.uint64)
+    by_fit = np.empty((lengths.size + 1, sizes), np.int64)  # by how many lengths fit above them
+    last, levels_used = -1, 0
+    counts[:] = 0
+    for k in range(len(placements)):
+        b, x, y, w, d, h, z = placements[k]
+        if b != last:
+            last = b
+            _levels(heightmap[b], empty_map[b], levels)
+            levels_used = _survey(
+                levels, fitting, inside, widths, depths, depth, rises, quarters, heights, bearing,
+                free, feasible, number,
+            )  # fmt: skip
+        for i in range(widths.size):
+            across = rows[max(0, x - widths[i] + 1), x + w]
+            for j in range(depths.size):
+                along = columns[max(0, y - depths[j] + 1), y + d]
+                touched[0, i * depths.size + j] = across[0] & along[0]
+                touched[1, i * depths.size + j] = across[1] & along[1]
+        by_fit[:] = 0
+        top, place = z + h, 0
+        for s in range(levels_used):
+            fit = by_fit[fitting[heights[s]]]
+            if heights[s] > top:
+                place += 1
+                for p in range(sizes):
+                    fit[p] += number[s, p]
+                continue
+            for word in range(2):
+                for p in range(sizes):
+                    fit[p] += _count_bits(feasible[s, word, p] & ~touched[word, p])
+        if fitting[top]:
+            low = levels[top, 0, 0] | (levels[z, 0, 0] & rows[x, x + w, 0] & columns[y, y + d, 0])
+            high = levels[top, 0, 1] | (levels[z, 0, 1] & rows[x, x + w, 1] & columns[y, y + d, 1])
+            for word in range(2):
+                for p in range(sizes):
+                    candidates[word, p] = free[place, word, p] & touched[word, p]
+            _test(candidates, low, high, widths, depths, depth, rises, quarters, tested)
+            for word in range(2):
+                for p in range(sizes):
+                    by_fit[fitting[top], p] += _count_bits(tested[word, p])
+        for i in range(widths.size):
+            for j in range(depths.size):
+                feasible_windows = 0
+                for tall in range(lengths.size - 1, -1, -1):
+                    feasible_windows += by_fit[tall + 1, i * depths.size + j]
+                    counts[k, i, j, tall] = feasible_windows
