@@ -47,8 +47,17 @@ class LearnedAgent:
         return probabilities
 
     def best(self, observation: Observation) -> Tensor:
-        """Return the most probable action, int64 [G], from one evaluation of the network."""
-        return self.actor(observation).squeeze(1).long()
+        """Return the most probable action, int64 [G], from one evaluation of the network.
+
+        Games without a legal action have ended: the network is not evaluated for them.
+        """
+        rows = observation["mask"].any(1).nonzero().squeeze(1)
+        action = torch.zeros(len(observation["mask"]), dtype=torch.int64, device=rows.device)
+        if len(rows) < len(action):
+            observation = {name: values[rows] for name, values in observation.items()}
+        if len(rows):
+            action[rows] = self.actor(observation).squeeze(1).long()
+        return action
 
     @torch.inference_mode()
     def __call__(self, game: Packing, *orientation: Tensor) -> Tensor:

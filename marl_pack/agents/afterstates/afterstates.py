@@ -77,7 +77,8 @@ class Afterstates:
             float32 [K].
         """
         boxes = self.counts[:1].numel() or 1
-        return (self.counts.flatten(1).sum(1).double() / boxes).float()
+        total = self.counts.flatten(1).sum(1, dtype=torch.int32)  # much faster than int64
+        return (total.double() / boxes).float()
 
     def feasible_probability(self, orientation_sets: Mapping[tuple[int, ...], float]) -> Tensor:
         """Compute the probability that the next item has a feasible cell.
@@ -358,33 +359,48 @@ def afterstates_by_compiled_loops(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
-def _share_feasible(counts: Any, axes: Any, share: Any) -> None:
-    """Write the share of boxes that have a feasible cell in at least one orientation.
+@cache
+def _groups(lengths: int, axes: tuple[tuple[int, int, int], ...]) -> tuple[Any, Any]:
+    """List the boxes that an item becomes in some orientations, once for all equal lists.
 
     Args:
-        counts: int32 [K, L, L, L].
-        axes: int64 [O, 3], rows of :data:`marl_pack.geometry.ORIENTATIONS`.
+        lengths: L.
+        axes: the orientations, rows of :data:`marl_pack.geometry.ORIENTATIONS`.
+
+    Returns:
+        The boxes int64 [I, O] as numbers of entries of a row of :attr:`Afterstates.counts`, and the
+        number of items int64 [I] with each list.
+    """
+    boxes = np.arange(lengths**3).reshape(lengths, lengths, lengths)
+    items = product(range(lengths), repeat=3)
+    lists = [sorted(boxes[tuple(item[a] for a in row)] for row in axes) for item in items]
+    return np.unique(np.array(lists, np.int64), axis=0, return_counts=True)
+
+
+@njit(cache=True, nogil=True)
+def _share_feasible(counts: Any, boxes: Any, items: Any, share: Any) -> None:
+    """Write the share of items that have a feasible cell in at least one orientation.
+
+    Args:
+        counts: int32 [K, L³].
+        boxes: int64 [I, O], see :func:`_groups`.
+        items: int64 [I], how many items become these boxes.
         share: float64 [K], written.
     """
-    lengths = counts.shape[1]
-    item = np.empty(3, np.int64)
-    items = lengths**3
-    for k in range(counts.shape[0]):
+    for k in range(len(counts)):
         feasible = 0
-        for i in range(items):
-            item[0], item[1], item[2] = i // lengths**2, i // lengths % lengths, i % lengths
-            for a in range(axes.shape[0]):
-                if counts[k, item[axes[a, 0]], item[axes[a, 1]], item[axes[a, 2]]]:
-                    feasible += 1
-                    break
-        share[k] = feasible / items
+        for i in range(len(boxes)):
+            cells = 0
+            for box in boxes[i]:
+                cells |= counts[k, box]
+            feasible += items[i] if cells else 0
+        share[k] = feasible / counts.shape[1]
 
 
 def _probability_compiled(counts: Tensor, axes: list[tuple[int, int, int]]) -> Tensor:
     """Compute the share of boxes with a feasible cell, float64 [K], in compiled loops."""
     share = np.empty(len(counts))
-    _share_feasible(counts.numpy(), np.array(axes).reshape(-1, 3), share)
+    _share_feasible(counts.flatten(1).numpy(), *_groups(counts.shape[1], tuple(axes)), share)
     return torch.from_numpy(share)
 
 

@@ -217,8 +217,8 @@ def _decide_word(free: Any, a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
 
 @njit(cache=True)
 def _test(
-    candidates: Any, low: Any, high: Any, widths: Any, depths: Any, depth: int, rises: Any,
-    quarters: Any, feasible: Any,
+    candidates: Any, low: Any, high: Any, widths: Any, depths: Any, halves: Any, depth: int,
+    rises: Any, quarters: Any, feasible: Any,
 ) -> None:  # fmt: skip
     """Find the feasible windows of each size on one level.
 
@@ -226,12 +226,13 @@ def _test(
         candidates: uint64 [2, I · J], the corners of the windows to test, without higher cells.
         low, high: the bearing cells of the level.
         widths, depths: int64 [I] and int64 [J], ascending: the sides of the windows.
+        halves: int64 [L], half of each length, rounded up.
         depth: D.
         rises: float64 [I, J, W, D, 2], see :func:`_rises`.
         quarters: uint64 [2, I · J], scratch.
         feasible: uint64 [2, I · J], written: those of ``candidates`` that are feasible.
     """
-    _corners(low, high, (widths + 1) // 2, (depths + 1) // 2, depth, quarters)
+    _corners(low, high, halves[: widths.size], halves[: depths.size], depth, quarters)
     for i in range(widths.size):
         across = widths[i] // 2 * depth
         for j in range(depths.size):
@@ -255,8 +256,8 @@ def _test(
 
 @njit(cache=True)
 def _survey(
-    levels: Any, fitting: Any, inside: Any, widths: Any, depths: Any, depth: int, rises: Any,
-    quarters: Any, heights: Any, bearing: Any, free: Any, feasible: Any, number: Any,
+    levels: Any, fitting: Any, inside: Any, widths: Any, depths: Any, halves: Any, depth: int,
+    rises: Any, quarters: Any, heights: Any, free: Any, feasible: Any, number: Any,
 ) -> int:  # fmt: skip
     """Find the feasible windows of a bin on each level that has cells, from the highest level on.
 
@@ -264,9 +265,8 @@ def _survey(
         levels: uint64 [H + 1, 2, 2], see :func:`_levels`.
         fitting: int64 [H + 1], how many of the lengths fit between each level and the bin's top.
         inside: uint64 [2, I · J], the corners of the windows that lie on the floor.
-        widths, depths, depth, rises, quarters: as for :func:`_test`.
+        widths, depths, halves, depth, rises, quarters: as for :func:`_test`.
         heights: int64 [S], written: the levels.
-        bearing: uint64 [S, 2], written: the bearing cells of each level.
         free: uint64 [S, 2, I · J], written: the corners of the windows without a higher cell.
         feasible: uint64 [S, 2, I · J], written: those that are feasible.
         number: int64 [S, I · J], written: how many are feasible.
@@ -279,15 +279,14 @@ def _survey(
         if not (levels[level, 1, 0] | levels[level, 1, 1]):
             continue
         heights[s] = level
-        bearing[s, 0], bearing[s, 1] = levels[level, 0, 0], levels[level, 0, 1]
         _corners(above_low, above_high, widths, depths, depth, quarters)
         for word in range(2):
             for p in range(inside.shape[1]):
                 free[s, word, p] = inside[word, p] & ~quarters[word, p]
         if fitting[level]:
             _test(
-                free[s], bearing[s, 0], bearing[s, 1], widths, depths, depth, rises, quarters,
-                feasible[s],
+                free[s], levels[level, 0, 0], levels[level, 0, 1], widths, depths, halves, depth,
+                rises, quarters, feasible[s],
             )  # fmt: skip
         else:
             feasible[s] = uint64(0)
@@ -305,6 +304,7 @@ def count_by_bits(
     """Count feasible cells as ``count_by_masks`` does, where :func:`fit_in_words` is true."""
     (width, depth), most = heightmap.shape[1:], min(fitting.size, heightmap[0].size)
     widths, depths = lengths[lengths <= width], lengths[lengths <= depth]
+    halves = (lengths + 1) // 2
     sizes = widths.size * depths.size
     rows, columns = _strips(width, depth)
     inside = np.empty((2, sizes), np.uint64)
@@ -316,11 +316,12 @@ def count_by_bits(
             inside[1, i * depths.size + j] = wide[1] & deep[1]
             _rises(widths[i], depths[j], rises[i, j])
     levels = np.empty((fitting.size, 2, 2), np.uint64)
-    heights, bearing = np.empty(most, np.int64), np.empty((most, 2), np.uint64)
+    heights = np.empty(most, np.int64)
     free, feasible = np.empty((most, 2, sizes), np.uint64), np.empty((most, 2, sizes), np.uint64)
     number = np.empty((most, sizes), np.int64)
     quarters, touched = np.empty((2, sizes), np.uint64), np.empty((2, sizes), np.uint64)
     candidates, tested = np.empty((2, sizes), np.uint64), np.empty((2, sizes), np.uint64)
+    nothing = np.zeros((2, sizes), np.uint64)
     by_fit = np.empty((lengths.size + 1, sizes), np.int64)  # by how many lengths fit above them
     last, levels_used = -1, 0
     counts[:] = 0
@@ -330,7 +331,7 @@ def count_by_bits(
             last = b
             _levels(heightmap[b], empty_map[b], levels)
             levels_used = _survey(
-                levels, fitting, inside, widths, depths, depth, rises, quarters, heights, bearing,
+                levels, fitting, inside, widths, depths, halves, depth, rises, quarters, heights,
                 free, feasible, number,
             )  # fmt: skip
         for i in range(widths.size):
@@ -341,26 +342,29 @@ def count_by_bits(
                 touched[1, i * depths.size + j] = across[1] & along[1]
         by_fit[:] = 0
         top, place = z + h, 0
+        while heights[place] > top:
+            place += 1
         for s in range(levels_used):
             fit = by_fit[fitting[heights[s]]]
-            if heights[s] > top:
-                place += 1
+            if heights[s] >= top:
                 for p in range(sizes):
                     fit[p] += number[s, p]
-                continue
-            for word in range(2):
+            else:
                 for p in range(sizes):
-                    fit[p] += _count_bits(feasible[s, word, p] & ~touched[word, p])
+                    low, high = feasible[s, 0, p] & ~touched[0, p], feasible[s, 1, p] & ~touched[1, p]
+                    fit[p] += _count_bits(low) + _count_bits(high)
         if fitting[top]:
+            known = feasible[place] if heights[place] == top else nothing
             low = levels[top, 0, 0] | (levels[z, 0, 0] & rows[x, x + w, 0] & columns[y, y + d, 0])
             high = levels[top, 0, 1] | (levels[z, 0, 1] & rows[x, x + w, 1] & columns[y, y + d, 1])
             for word in range(2):
                 for p in range(sizes):
-                    candidates[word, p] = free[place, word, p] & touched[word, p]
-            _test(candidates, low, high, widths, depths, depth, rises, quarters, tested)
-            for word in range(2):
-                for p in range(sizes):
-                    by_fit[fitting[top], p] += _count_bits(tested[word, p])
+                    candidates[word, p] = free[place, word, p] & touched[word, p] & ~known[word, p]
+            _test(
+                candidates, low, high, widths, depths, halves, depth, rises, quarters, tested
+            )  # fmt: skip
+            for p in range(sizes):
+                by_fit[fitting[top], p] += _count_bits(tested[0, p]) + _count_bits(tested[1, p])
         for i in range(widths.size):
             for j in range(depths.size):
                 feasible_windows = 0
