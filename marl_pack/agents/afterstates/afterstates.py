@@ -47,6 +47,7 @@ PER_THREAD = 256
 """Smallest number of placements for which several threads share the work."""
 
 
+@cache
 def probe_lengths(shortest: int, longest: int) -> tuple[int, ...]:
     """Return at most :data:`MOST_LENGTHS` evenly spaced lengths from shortest to longest."""
     count = min(MOST_LENGTHS, longest - shortest + 1)

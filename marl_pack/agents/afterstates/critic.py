@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from marl_pack.agents.afterstates.features import FEATURES, features
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.layers import initialized
+from marl_pack.agents.layers import initialized, linear_relu
 from marl_pack.checks import whole_number
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
@@ -42,6 +42,14 @@ class AfterstateCritic(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Estimate the values, float32 [K], from features [K, :data:`FEATURES`]."""
         value: Tensor = self.layers(inputs).squeeze(1)
+        return value
+
+    @torch.no_grad()
+    def estimate(self, inputs: Tensor) -> Tensor:
+        """Estimate the values as :meth:`forward` does, but without gradients."""
+        for layer in self.layers[:-1:2]:
+            inputs = linear_relu(layer, inputs)
+        value: Tensor = self.layers[-1](inputs).squeeze(1)
         return value
 
 

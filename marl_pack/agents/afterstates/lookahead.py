@@ -20,8 +20,10 @@ from marl_pack.game.packing import Packing
 
 T = TypeVar("T")
 
-AT_ONCE = 1 << 15
-"""Largest number of afterstates that the critic values at once."""
+AT_ONCE = {"cpu": 1 << 11, "cuda": 1 << 15}
+"""Largest number of afterstates that the critic values at once on each device."""
+MULTIPLE = 256
+"""Divides these numbers: a CPU prepares its code for each number of rows, so there are few."""
 
 MANY_CELLS = 1000
 """Cells of a floor above which a decision takes more than about a second on a CPU."""
@@ -65,8 +67,8 @@ class Memo:
 class Value(Protocol):
     """A critic of afterstates: features [K, F] → the return still to come [K]."""
 
-    def __call__(self, inputs: Tensor, /) -> Tensor:
-        """Estimate the values, float32 [K]."""
+    def estimate(self, inputs: Tensor, /) -> Tensor:
+        """Estimate the values, float32 [K], without gradients."""
 
 
 class Lookahead:
@@ -141,15 +143,16 @@ class Lookahead:
 
         def compute() -> Tensor:
             afterstates, spec = self.afterstates(game), game.spec
-            rows = torch.arange(len(afterstates.volume), device=game.device)
-            with torch.no_grad():
-                value = [
-                    critic(features(afterstates, game.volume, part))
-                    for part in torch.split(rows, AT_ONCE)
-                ]
+            count = len(afterstates.volume)
+            rows = torch.arange(-(-count // MULTIPLE) * MULTIPLE, device=game.device)
+            values = [
+                critic.estimate(features(afterstates, game.volume, part.clamp(max=count - 1)))
+                for part in torch.split(rows, AT_ONCE[game.device.type])
+            ]
             gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
             reward = (gain - loss) / game.volume
-            return afterstates.as_map((reward + torch.cat(value)).float(), game.mask, ILLEGAL)
+            value = torch.cat(values)[:count]
+            return afterstates.as_map((reward + value).float(), game.mask, ILLEGAL)
 
         return self.memo.once(game, ("afterstate_value", critic), compute)
 
