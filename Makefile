@@ -61,6 +61,7 @@ benchmark: $(STAMP)  ## measure every figure of docs/results.md on speed
 	$(BIN)/python -m benchmarks.room
 	$(BIN)/python -m benchmarks.game
 	$(BIN)/python -m benchmarks.training
+	$(BIN)/python -m benchmarks.play
 
 results: $(STAMP)  ## make docs/results.md of the figures in results/
 	$(BIN)/python -m experiments.page

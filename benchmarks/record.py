@@ -35,7 +35,8 @@ PROGRAMS = {
     **{name: f"experiments.{name}" for name in (
         "ablations", "learning_curve", "planning", "afterstates", "volume_spread")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
-    **{name: f"benchmarks.{name}" for name in ("masks", "rules", "room", "game", "training")},
+    **{name: f"benchmarks.{name}" for name in (
+        "masks", "rules", "room", "game", "training", "play")},
 }  # fmt: skip
 """The program that makes each table."""
 

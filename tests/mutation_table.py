@@ -399,7 +399,7 @@ MUTATIONS = (
        "reward = (gain - loss) / game.volume", "reward = (gain + loss) / game.volume",
        "afterstates::the_afterstate_value_is_the_reward_and_the_critics_value"),
     _m("afterstates: features change with the rotated footprint", "agents/afterstates/features.py",
-       "both = counts + counts.transpose(1, 2)", "both = 2 * counts",
+       "counts[row, i, j, tall] + counts[row, j, i, tall]", "2 * counts[row, i, j, tall]",
        "afterstates::features_do_not_change_when_the_bin_is_rotated"),
     _m("afterstates: the filled share lacks the box", "agents/afterstates/afterstates.py",
        "torch.from_numpy(waste), bins.filled[placements[:, 0]] + volume, bins.backend,",

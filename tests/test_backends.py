@@ -10,6 +10,7 @@ from conftest import boxes_of, in_play, off_centre, random_maps, random_play, so
 
 from marl_pack import bins as state
 from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
+from marl_pack.agents.afterstates.features import features
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
 from marl_pack.geometry import resting_heights_and_waste
@@ -257,6 +258,7 @@ def fields_of(
         left.filled[:, None], left.feasible_cells()[:, None],
         left.feasible_probability({allowed: 1.0})[:, None],
         left.feasible_probability({(0, 1): 0.3, allowed: 0.7})[:, None],
+        features(left, 10_000),
     ]  # fmt: skip
     return [torch.where(mask[..., None], values[left.index], 0) for values in numbers]
 

@@ -102,9 +102,8 @@ class Afterstates:
 
     def as_map(self, values: Tensor, mask: Tensor, elsewhere: float = 0.0) -> Tensor:
         """Return numbers [K] as a map [N, A, W, D], with ``elsewhere`` where the mask is false."""
-        if not len(values):
-            return torch.full(mask.shape, elsewhere, dtype=values.dtype, device=values.device)
-        return torch.where(mask, values[self.index], elsewhere)
+        code = self.backend.pick(compiled=_map_compiled, tensor=_map_tensor)
+        return code(values, self.index, mask, elsewhere)
 
 
 def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Afterstates:
@@ -360,6 +359,22 @@ def afterstates_by_compiled_loops(
     )  # fmt: skip
 
 
+@njit(cache=True, nogil=True)
+def _write_map(values: Any, index: Any, mask: Any, chosen: Any) -> None:
+    """Write ``values[index]`` to the flat array ``chosen`` where the flat mask is true."""
+    for k in range(chosen.size):
+        if mask[k]:
+            chosen[k] = values[index[k]]
+
+
+def _map_compiled(values: Tensor, index: Tensor, mask: Tensor, elsewhere: float) -> Tensor:
+    """Compute :meth:`Afterstates.as_map` in a compiled loop."""
+    chosen = torch.full(mask.shape, elsewhere, dtype=values.dtype)
+    flat = (tensor.reshape(-1).numpy() for tensor in (index, mask, chosen))
+    _write_map(values.numpy(), *flat)
+    return chosen
+
+
 @cache
 def _groups(lengths: int, axes: tuple[tuple[int, int, int], ...]) -> tuple[Any, Any]:
     """List the boxes that an item becomes in some orientations, once for all equal lists.
@@ -517,6 +532,13 @@ def _blocking_sets(w: int, d: int) -> tuple[tuple[tuple[int, int, int], ...], ..
         of_row = {i: [j for x, j in part if x == i] for i, _ in part}
         runs.append(tuple((i, min(js), len(js)) for i, js in sorted(of_row.items())))
     return tuple(sorted(runs))
+
+
+def _map_tensor(values: Tensor, index: Tensor, mask: Tensor, elsewhere: float) -> Tensor:
+    """Compute :meth:`Afterstates.as_map` in tensor code."""
+    if not len(values):
+        return torch.full(mask.shape, elsewhere, dtype=values.dtype, device=values.device)
+    return torch.where(mask, values[index], elsewhere)
 
 
 def _surface(heights: Tensor, height: int) -> Tensor:

@@ -351,7 +351,10 @@ def count_by_bits(
                     fit[p] += number[s, p]
             else:
                 for p in range(sizes):
-                    low, high = feasible[s, 0, p] & ~touched[0, p], feasible[s, 1, p] & ~touched[1, p]
+                    low, high = (
+                        feasible[s, 0, p] & ~touched[0, p],
+                        feasible[s, 1, p] & ~touched[1, p],
+                    )
                     fit[p] += _count_bits(low) + _count_bits(high)
         if fitting[top]:
             known = feasible[place] if heights[place] == top else nothing

@@ -47,9 +47,8 @@ class AfterstateCritic(nn.Module):
     @torch.no_grad()
     def estimate(self, inputs: Tensor) -> Tensor:
         """Estimate the values as :meth:`forward` does, but without gradients."""
-        for layer in self.layers[:-1:2]:
-            inputs = linear_relu(layer, inputs)
-        value: Tensor = self.layers[-1](inputs).squeeze(1)
+        first, _, second, _, last = self.layers
+        value: Tensor = last(linear_relu(second, linear_relu(first, inputs))).squeeze(1)
         return value
 
 
