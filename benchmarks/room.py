@@ -2,7 +2,8 @@
 
 The bins are partly filled by random play. For every legal placement of the visible items, the code
 counts the cells in which each of the next boxes could be placed. Three codes are timed: sets of
-cells as bits (floors of up to 128 cells), compiled masks, and tensor code.
+cells as bits (floors of up to 128 cells), compiled masks, and tensor code. Then whole decisions are
+timed on a large floor, where the agents see samples of the columns.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from marl_pack.agents.afterstates.afterstates import (
 from marl_pack.agents.afterstates.bitboards import fit_in_words
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
+from marl_pack.agents.player import load
 from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
 
@@ -40,7 +42,7 @@ def seconds(
 
 
 def main() -> None:
-    """Time the afterstates for two sizes of the bin."""
+    """Time the afterstates for two sizes of the bin, and decisions on a large floor."""
     measured = Measurements("room", __doc__, seed=1)
     measured.parse()
     torch.set_num_threads(1)
@@ -66,6 +68,14 @@ def main() -> None:
                 us_item=1e6 * time / n,
                 times_compiled_masks=masks / time,
             )
+    game = Packing(1, (120, 100, 100), sides=(20, 50), seed=1)
+    for _ in range(5):
+        game.place(*make_policy("dblf")(game))
+    one = torch.tensor([0])
+    for name in ("max_feasible", "rs"):
+        player = load(name)
+        time = best_time(lambda p=player: p(game.branch(one)), 5)  # type: ignore[misc]  # bound now
+        measured.keep(f"a decision on 120 × 100 cells: {name}", ms=1e3 * time)
 
 
 if __name__ == "__main__":

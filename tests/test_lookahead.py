@@ -20,6 +20,7 @@ from marl_pack.agents.afterstates.afterstates import (
 )
 from marl_pack.agents.afterstates.bitboards import count_by_bits, fit_in_words
 from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.afterstates.sampled import sampled_afterstates, samples
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
@@ -222,8 +223,29 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         assert torch.equal(alone, shared)
 
 
-def test_a_floor_of_many_cells_is_warned_of_with_the_reason() -> None:
-    game = Packing(1, (40, 30, 4), sides=(4, 4), rule="none")
-    game.mask[:, :, 3:] = False  # few placements, so that it is fast here
-    with pytest.warns(UserWarning, match=r"floor of 40 x 30 cells: the time of .* larger cells"):
-        Lookahead().afterstates(game)
+@pytest.mark.parametrize("backend", Backend)
+def test_a_large_floor_is_seen_at_every_second_column(backend: Backend) -> None:
+    game = in_play(2, 6, bin=(18, 15, 9), sides=(1, 5))
+    assert [list(cells) for cells in samples(18, 15)] == [[*range(1, 18, 2)], [*range(1, 15, 2)]]
+    boxes = list(product((1, 1, 2, 2, 3), (1, 1, 2, 2, 3), (1, 2, 3, 4, 5)))
+    bins, *others = arguments_of(game)
+    afterstates = sampled_afterstates(replace(bins, backend=backend), *others)  # type: ignore[type-var]  # untyped list
+    for g, o, x, y in game.mask.nonzero()[::80].tolist():
+        after = game.branch(torch.tensor([g]))
+        after.place(torch.tensor([o]), torch.tensor([x * 15 + y]))
+        maps = [m[0, 1::2, 1::2].numpy() for m in (after.bins.heightmap, after.bins.empty_map)]
+        row = afterstates.index[g, o, x, y]
+        cells = [legal_cells(*maps, box, 9) for box in boxes]
+        assert afterstates.counts[row].flatten().tolist() == cells
+        assert afterstates.filled[row] == after.bins.filled
+        wasted = after.bins.empty_map.sum() - game.bins.empty_map[g].sum()
+        assert afterstates.waste[row] <= wasted
+        assert afterstates.volume[row] == after.bins.filled - game.bins.filled[g]
+
+
+def test_a_large_floor_has_few_afterstates_and_a_small_one_those_of_all_columns() -> None:
+    large = Packing(1, (120, 100, 100), sides=(20, 50))
+    assert len(Lookahead().afterstates(large).counts) < 3000 < int(large.mask.sum())
+    small = in_play(2, 3, bin=(15, 15, 8), sides=(2, 4))
+    exact = afterstates_of(*arguments_of(small))  # type: ignore[arg-type]  # untyped tuple
+    assert torch.equal(Lookahead().afterstates(small).counts, exact.counts)

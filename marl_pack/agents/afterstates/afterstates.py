@@ -106,7 +106,13 @@ class Afterstates:
         return code(values, self.index, mask, elsewhere)
 
 
-def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[int]) -> Afterstates:
+def afterstates_of(
+    bins: Bins,
+    sides: Tensor,
+    mask: Tensor,
+    lengths: Sequence[int],
+    heights: Sequence[int] | None = None,
+) -> Afterstates:
     """Compute the afterstate of each legal placement.
 
     Args:
@@ -114,9 +120,10 @@ def afterstates_of(bins: Bins, sides: Tensor, mask: Tensor, lengths: Sequence[in
         sides: int16 [N, A, 3], the item's sides along x, y, z in A orientations.
         mask: bool [N, A, W, D], where the item may be placed.
         lengths: the L lengths of the next boxes' sides, ascending.
+        heights: their L heights, ascending; by default the same.
     """
     code = bins.backend.pick(compiled=afterstates_by_compiled_loops, tensor=_tensor)
-    return code(bins, sides, mask, tuple(lengths))
+    return code(bins, sides, mask, tuple(lengths), heights)
 
 
 # --- compiled -------------------------------------------------------------------------------------
@@ -293,7 +300,7 @@ def count_by_masks(
         empty_map: int16 [N, W, D].
         placements: int64 [K, 7], see :func:`_placements`.
         lengths: int64 [L], ascending.
-        fitting: int64 [H + 1], how many of the lengths fit between each level and the bin's top.
+        fitting: int64 [H + 1], how many of the heights fit between each level and the bin's top.
         counts: int32 [K, L, L, L], written, for boxes lengths[i] × lengths[j] × lengths[k].
     """
     n, shape = len(placements), heightmap.shape[1:]
@@ -321,12 +328,13 @@ def afterstates_by_compiled_loops(
     sides: Tensor,
     mask: Tensor,
     lengths: tuple[int, ...],
+    heights: Sequence[int] | None = None,
     count_cells: Callable[..., None] | None = None,
 ) -> Afterstates:
     """Compute :func:`afterstates_of` in compiled loops.
 
     Args:
-        bins, sides, mask, lengths: as for :func:`afterstates_of`.
+        bins, sides, mask, lengths, heights: as for :func:`afterstates_of`.
         count_cells: :func:`marl_pack.agents.afterstates.bitboards.count_by_bits` or
             :func:`count_by_masks`; by default the faster function that works on the floor.
     """
@@ -335,7 +343,9 @@ def afterstates_by_compiled_loops(
     index = np.zeros(mask.shape, np.int64)
     placements, waste = _placements(legal, boxes, heightmap, index)
     count, probes, shape = len(placements), np.array(lengths), bins.size[:2]
-    fitting = (probes <= bins.height - np.arange(bins.height + 1)[:, None]).sum(1)
+    fitting = (
+        np.array(heights or lengths) <= bins.height - np.arange(bins.height + 1)[:, None]
+    ).sum(1)
     counts = np.empty((count, *[len(lengths)] * 3), np.int32)
     surface = np.empty((count, SURFACE), np.float32)
     by_bits = bitboards.fit_in_words(*shape)
@@ -423,9 +433,16 @@ def _probability_compiled(counts: Tensor, axes: list[tuple[int, int, int]]) -> T
 # --- tensor code ----------------------------------------------------------------------------------
 
 
-def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -> Afterstates:
+def _tensor(
+    bins: Bins,
+    sides: Tensor,
+    mask: Tensor,
+    lengths: tuple[int, ...],
+    heights: Sequence[int] | None = None,
+) -> Afterstates:
     """Compute :func:`afterstates_of` in tensor code; the program waits for the number K once."""
     width, depth, height = bins.size
+    boxes = lengths, tuple(heights or lengths)
     placements = mask.nonzero()
     index = (mask.flatten().cumsum(0) - 1).clamp(min=0).view(mask.shape)
     longest = [max((i for i in lengths if i <= side), default=0) for side in (width, depth)]
@@ -439,7 +456,7 @@ def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -
         box, heightmap, empty_map = sides[b, a], bins.heightmap[b], bins.empty_map[b]
         under = footprint(width, depth, box, part[:, 2:])
         waste.append(place_boxes(heightmap, empty_map, under, box[:, 2])[1])
-        counts.append(count_cells(heightmap, empty_map, lengths, height))
+        counts.append(count_cells(heightmap, empty_map, boxes, height))
         surface.append(_surface(heightmap, height))
     volume = sides[placements[:, 0], placements[:, 1]].long().prod(1)
     return Afterstates(
@@ -448,25 +465,27 @@ def _tensor(bins: Bins, sides: Tensor, mask: Tensor, lengths: tuple[int, ...]) -
     )  # fmt: skip
 
 
-def _count_by_masks(
-    heightmap: Tensor, empty_map: Tensor, lengths: tuple[int, ...], height: int
-) -> Tensor:
+Boxes = tuple[tuple[int, ...], tuple[int, ...]]
+"""The lengths of boxes along x and y, and their heights: each combination is a box."""
+
+
+def _count_by_masks(heightmap: Tensor, empty_map: Tensor, boxes: Boxes, height: int) -> Tensor:
     """Count the cells where each box could be placed on maps [K, W, D], int32 [K, L, L, L]."""
-    boxes = torch.tensor(list(product(lengths, repeat=3)), dtype=torch.int16)
-    boxes = boxes.to(heightmap.device).expand(len(heightmap), -1, -1)
-    legal, _ = hull_tensor.support_mask(heightmap, empty_map, boxes, height)
+    lengths, heights = boxes
+    sides = torch.tensor(list(product(lengths, lengths, heights)), dtype=torch.int16)
+    sides = sides.to(heightmap.device).expand(len(heightmap), -1, -1)
+    legal, _ = hull_tensor.support_mask(heightmap, empty_map, sides, height)
     return legal.sum((2, 3), dtype=torch.int32).view(-1, *[len(lengths)] * 3)
 
 
-def _count_by_rows(
-    heightmap: Tensor, empty_map: Tensor, lengths: tuple[int, ...], height: int
-) -> Tensor:
+def _count_by_rows(heightmap: Tensor, empty_map: Tensor, boxes: Boxes, height: int) -> Tensor:
     """Count as :func:`_count_by_masks` does, but without reading a window cell by cell.
 
     A window's middle lies strictly inside the hull of its contact cells iff each of the sets in
     :func:`_blocking_sets` contains a contact cell: the largest K
     (:mod:`marl_pack.stability.hull_compiled`) of each set is that of the window.
     """
+    lengths, heights = boxes
     kind = torch.uint8 if height <= 126 else torch.int16
     level = (2 * heightmap + (empty_map == 0)).to(kind).permute(1, 2, 0).contiguous()
     width, depth, count = level.shape  # the placements are last, so that loops run along them
@@ -483,7 +502,7 @@ def _count_by_rows(
             torch.minimum, (_largest(runs, rows, shape) for rows in _blocking_sets(w, d))
         )
         stands = (least == best) & (best & 1).bool()
-        for k, tall in enumerate(lengths):
+        for k, tall in enumerate(heights):
             if tall <= height:  # a comparison of two tensors is faster than one with a number
                 low = best.clamp(max=2 * (height - tall) + 1) == best
                 counts[i, j, k] = _cells(stands & low)

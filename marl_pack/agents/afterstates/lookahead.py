@@ -6,7 +6,6 @@ it.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
@@ -16,6 +15,7 @@ from torch import Tensor
 from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
 from marl_pack.agents.afterstates.features import features
 from marl_pack.agents.afterstates.limits import ILLEGAL
+from marl_pack.agents.afterstates.sampled import EXACT_CELLS, sampled_afterstates
 from marl_pack.game.packing import Packing
 
 T = TypeVar("T")
@@ -24,14 +24,6 @@ AT_ONCE = {"cpu": 1 << 11, "cuda": 1 << 15}
 """Largest number of afterstates that the critic values at once on each device."""
 MULTIPLE = 256
 """Divides these numbers: a CPU prepares its code for each number of rows, so there are few."""
-
-MANY_CELLS = 1000
-"""Cells of a floor above which a decision takes more than about a second on a CPU."""
-SLOW = (
-    "a decision takes seconds on a floor of {width} x {depth} cells: the time of afterstates grows "
-    "with the square of the number of cells; use larger cells, or a policy without afterstates "
-    "(not max_feasible, no planes feasible_cells, feasible_probability, afterstate_value)"
-)
 
 
 class Memo:
@@ -91,10 +83,9 @@ class Lookahead:
 
         def compute() -> Afterstates:
             width, depth, _ = game.size
-            if width * depth > MANY_CELLS and game.device.type == "cpu":
-                warnings.warn(SLOW.format(width=width, depth=depth), stacklevel=2)
+            code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
             sides = game.orient_item(game.items).sides
-            return afterstates_of(game.bins, sides, game.mask, probe_lengths(*game.stream.sides))
+            return code(game.bins, sides, game.mask, probe_lengths(*game.stream.sides))
 
         return self.memo.once(game, "afterstates", compute)
 
