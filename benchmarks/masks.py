@@ -6,9 +6,13 @@
 2. Batched masks at 10 × 10, on every device.
 3. The cost for several sizes of the grid.
 4. One mask from NumPy arrays by :func:`marl_pack.stable_mask`, its checks included.
+5. The cost on rough maps, compared with a flat floor: single columns stand one cell higher, so most
+   windows rest on a few of them and need the exact test.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,6 +20,7 @@ import torch
 from benchmarks.record import Measurements
 from benchmarks.states import LARGE, SMALL, in_play, random_items
 from benchmarks.timing import best_time, devices
+from marl_pack.bins import empty
 from marl_pack.stability import (
     RULES,
     OrientedItem,
@@ -107,6 +112,27 @@ def from_arrays(measured: Measurements, states: int = 16) -> None:
         measured.keep(f"stable_mask: {width} × {depth}", us=1e6 * seconds / states)
 
 
+def rough(measured: Measurements) -> None:
+    """Measure figure 5: one mask of a rough map, compared with that of a flat floor."""
+    for side in (10, 40, 120):
+        n = max(4, (1 << 14) // side**2)
+        length = side // 5
+        generator = torch.Generator().manual_seed(1)
+        high = torch.rand((n, side, side), generator=generator) < 5 / length**2
+        flat = empty(n, (side, side, side), 1)
+        item = OrientedItem(torch.tensor([[[length, length, 1]]]).short().expand(n, 1, 3))
+        for margin in (0.0, 0.5):
+            easy, hard = (
+                best_time(lambda b=bins, m=margin, i=item: hull_alpha(b, i, m))  # type: ignore[misc]  # bound now
+                for bins in (flat, replace(flat, heightmap=high.short()))
+            )
+            measured.keep(
+                f"rough map: {side} × {side}, margin {margin}",
+                us=1e6 * hard / n,
+                times_flat_floor=hard / easy,
+            )
+
+
 def main() -> None:
     """Measure all figures of this benchmark."""
     measured = Measurements("masks", __doc__, seed=1)
@@ -116,6 +142,7 @@ def main() -> None:
     batched(measured)
     scaling(measured)
     from_arrays(measured)
+    rough(measured)
 
 
 if __name__ == "__main__":

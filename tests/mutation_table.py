@@ -327,6 +327,11 @@ MUTATIONS = (
        "left_rise * right_run + right_rise * left_run < 0",
        "stability_rules::three_pillars_hold_their_triangle",
        "stability_rules::diagonal_pillars_hold_only_what_lies_between_their_outer_corners"),
+    _m("stability: the middle on the hull's edge is inside (many windows)",
+       "stability/hull_exact.py",
+       "if not left + right > tolerance * (abs(left) + abs(right)):",
+       "if not left + right > -tolerance * (abs(left) + abs(right)):",
+       "backends::hull_masks_of_rough_maps_equal_the_reference"),
     _m("stability: a point on the hull's edge is inside", "stability/hull_exact.py",
        "        if distance <= -error:\n" "            return OUTSIDE\n"
        "        if distance <= error:", "        if distance < -error:\n"

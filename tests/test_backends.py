@@ -164,6 +164,28 @@ def test_hull_masks_equal_the_reference(
 
 
 @every_backend
+@pytest.mark.parametrize(("margin", "offset"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.1), (0.5, 0.1)])
+def test_hull_masks_of_rough_maps_equal_the_reference(
+    backend: Backend, margin: float, offset: float
+) -> None:
+    # Few columns stand one cell higher, so most windows rest on two to six of them.
+    high = np.random.default_rng(0).random((2, 14, 15)) < 0.15
+    bins = replace(state.empty(2, (14, 15, 9), 1), heightmap=torch.from_numpy(high).short())
+    item = OrientedItem(
+        torch.tensor([[[6, 5, 2], [5, 6, 2]]] * 2).short(), ((offset, -offset),) * 2
+    )
+    bins = replace(bins, backend=backend)
+
+    def stands(b: int, a: int, x: int, y: int, w: int, d: int) -> bool:
+        window = np.s_[b, x : x + w, y : y + d]
+        heights = bins.heightmap.numpy()[window]
+        return reference.hull(heights, heights >= 0, item.exact_centre(a, w, d), margin)
+
+    mask = make_rule("hull_alpha", margin=margin)(bins, item)
+    assert (mask.numpy() == expected(bins, item, stands)).all()
+
+
+@every_backend
 @pytest.mark.parametrize(("size", "sides"), PLACES)
 @pytest.mark.parametrize("thresholds", ["paper", "code"])
 def test_area_masks_equal_the_reference(

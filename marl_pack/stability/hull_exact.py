@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_pack.geometry.compiled import slide
 from marl_pack.installation import njit
 
 YES, UNDECIDED = 2, 1
@@ -23,8 +24,17 @@ OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 ROUNDING = 2.0**-48
 """Relative error of the distance to an edge that float64 never exceeds."""
 
-LOOKUP_CELLS = 64
-"""For windows of more cells than this, tables of the whole map give the extremes of their rows."""
+READ_CELLS = 4
+"""If windows have more cells than this for each cell of the map, none is read by itself."""
+
+AT_ONCE = 128
+"""Number of neighbouring windows that are solved together."""
+
+STEEPEST = 1e6
+"""The rise to a corner right above the middle: larger than all other rises."""
+
+FLOAT32_CELLS = 1 << 20
+"""In windows of more cells than this, float32 does not tell all rises apart."""
 
 
 @njit(cache=True, inline="always")
@@ -176,30 +186,133 @@ def middle_inside(lo: Any, hi: Any, d: int) -> bool:
 
 
 @njit(cache=True)
-def _mark_neighbours(levels: Any, top: int, next_y: Any, previous_y: Any) -> None:
-    """Find the nearest cell of level ``top`` in the same row, for each cell [W, D] and direction.
+def _pack(levels: Any, start: Any, depth: int, sign: int, first: int, keys: Any) -> None:
+    """Write K and the place in its row, ``first + sign · y``, of each column as one number."""
+    for y in range(np.uint64(depth)):
+        place = first + sign * np.int64(y)
+        keys[start + y] = np.int32(levels[start + y]) << 16 | place
 
-    If the cell itself has level ``top``, it is the nearest cell in both directions.
+
+@njit(cache=True)
+def _unpack(
+    keys: Any, start: Any, depth: int, sign: int, beyond: int, rows: Any, rises: Any
+) -> None:
+    """Write K of each key, and twice the distance from y to its place, plus ``beyond``."""
+    for y in range(np.uint64(depth)):
+        place = keys[start + y] & 0xFFFF
+        rows[start + y] = keys[start + y] >> 16
+        rises[start + y] = np.float32(np.int32(2 * (place - sign * np.int64(y)) + beyond))
+
+
+@njit(cache=True)
+def _row_windows(levels: Any, depth: int, d: int, keys: Any, rows: Any, rises: Any) -> None:
+    """Find the highest columns of every window of 1 × d cells, and the first and last of them.
+
+    A key is a column's K and its place in the row, so the largest key of a window gives both.
 
     Args:
-        levels: integers [W, D], K of every column.
-        top: the level.
-        next_y: int16 [W, D], written: y of the nearest cell with the same or a larger y, or D.
-        previous_y: int16 [W, D], written: y of the nearest cell with the same or a smaller y, or
-            -1.
+        levels: integers [W · D], K of every column.
+        depth: D.
+        d: the windows' cells along y.
+        keys: int32 [3, W · D], scratch.
+        rows: int32 [W · D], written: the largest K of each window.
+        rises: float32 [2, W · D], written: in half cells, how far the last cell with this K reaches
+            beyond the window's middle towards larger y, and the first towards smaller y.
     """
-    depth = levels.shape[1]
-    for x in range(levels.shape[0]):
-        last = -1
-        for y in range(depth):
-            if levels[x, y] == top:
-                last = y
-            previous_y[x, y] = last
-        last = depth
-        for y in range(depth - 1, -1, -1):
-            if levels[x, y] == top:
-                last = y
-            next_y[x, y] = last
+    for side in range(2):
+        sign, first = (1, 0) if side == 0 else (-1, depth - 1)
+        beyond = 2 - d if side == 0 else d + 2 - 2 * depth
+        for x in range(levels.size // depth):
+            _pack(levels, np.uint64(x * depth), depth, sign, first, keys[0])
+        best = slide(keys[0], keys[1], keys[2], depth, np.int64(1), np.int64(d))
+        for x in range(levels.size // depth):
+            _unpack(best, np.uint64(x * depth), depth, sign, beyond, rows, rises[side])
+
+
+@njit(cache=True)
+def _in_contact(rows: Any, tops: Any, row: Any, start: Any, n: int) -> bool:
+    """Return whether any of n neighbouring windows has contact in a row of its cells."""
+    contacts: Any = 0
+    for i in range(np.uint64(n)):
+        contacts += np.int32(rows[row + i] == tops[start + i])
+    return contacts > 0
+
+
+@njit(cache=True)
+def _steepen(
+    rows: Any, rises: Any, tops: Any, row: Any, start: Any, n: int, near: Any, far: Any,
+    steepest: Any,
+) -> None:  # fmt: skip
+    """Raise the steepest rises of n neighbouring windows by those to a row of their cells.
+
+    Args:
+        rows: int32 [W · D], see :func:`_row_windows`.
+        rises: float32 [W · D], one side of those of :func:`_row_windows`.
+        tops: int32 [P], see :func:`_middles_inside`.
+        row: uint64, position of the first window's row.
+        start: uint64, position of the first window.
+        n: number of windows.
+        near: float32, 1 / distance from the middle to the row's nearer corners along x.
+        far: float32, 1 / distance to its farther corners.
+        steepest: float32 [≥ n], raised.
+    """
+    none = np.float32(-np.inf)
+    for i in range(np.uint64(n)):
+        rise = max(rises[row + i] * near, rises[row + i] * far)
+        rise = rise if rows[row + i] == tops[start + i] else none
+        steepest[i] = max(steepest[i], rise)
+
+
+@njit(cache=True, inline="always")
+def _inverse(distance: int) -> Any:
+    """Return 1 / distance as float32; a corner right above the middle is the steepest of all."""
+    return np.float32(1 / distance) if distance > 0 else np.float32(STEEPEST)
+
+
+@njit(cache=True)
+def _middles_inside(tops: Any, rows: Any, rises: Any, depth: int, w: int, d: int, out: Any) -> None:
+    """Write for each undecided window whether its middle lies inside the hull of its contact.
+
+    This is :func:`middle_inside` for many windows at a time, in loops that become vector code:
+    unsigned positions need no check for negative ones. Rises are fractions of whole numbers. Two
+    that do not cancel differ by more than the tolerance, so float32 decides exactly.
+
+    Args:
+        tops: int32 [P], K of each window's contact; -1 for windows that are decided.
+        rows: int32 [W · D], see :func:`_row_windows`.
+        rises: float32 [2, W · D], see :func:`_row_windows`.
+        depth: D.
+        w: the windows' cells along x.
+        d: the windows' cells along y.
+        out: uint8 [W · D], written at the undecided positions: OUTSIDE or INSIDE.
+    """
+    tolerance = np.float32(1 / (4 * np.int64(w) * d))
+    steepest = np.empty((2, 2, AT_ONCE), np.float32)  # in each direction, left and right
+    for start in range(0, tops.size, AT_ONCE):
+        n = min(AT_ONCE, tops.size - start)
+        if tops[start : start + n].max() < 0:
+            continue
+        steepest[:] = np.float32(-np.inf)
+        for x in range(w):
+            row, first = np.uint64(start + x * depth), np.uint64(start)
+            if not _in_contact(rows, tops, row, first, n):
+                continue
+            for half in range(2):  # in half cells, the corners lie at 2x - w and 2x + 2 - w
+                far = w - 2 * x if half == 0 else 2 * x + 2 - w
+                if far > 0:
+                    near = far - 2 if far > 1 else 1
+                    for side in range(2):
+                        _steepen(
+                            rows, rises[side], tops, row, first, n, _inverse(near), _inverse(far),
+                            steepest[side, half],
+                        )  # fmt: skip
+        for i in range(n):
+            if tops[start + i] >= 0:
+                out[start + i] = INSIDE
+                for side in range(2):
+                    left, right = steepest[side, 0, i], steepest[side, 1, i]
+                    if not left + right > tolerance * (abs(left) + abs(right)):
+                        out[start + i] = OUTSIDE
 
 
 @njit(cache=True, inline="always")
@@ -214,6 +327,41 @@ def _level_extremes(
                 first = min(first, j)
                 last = j
         lo[i], hi[i] = first, last
+
+
+@njit(cache=True)
+def _solve_together(
+    codes: Any, best: Any, levels: Any, depth: int, w: int, d: int, x: float, y: float, unit: float,
+    margin: float, whole: bool, middle: bool, scratch: Any, out: Any,
+) -> int:  # fmt: skip
+    """Do the work of :func:`solve_undecided` without reading the windows one by one.
+
+    ``levels`` and ``out`` are flat here; ``middle`` says whether the point is the window's middle.
+    """
+    numbers, rises = np.empty((5, levels.size), np.int32), np.empty((2, levels.size), np.float32)
+    rows, tops = numbers[3], numbers[4, : codes.size]
+    for position in range(codes.size):
+        tops[position] = best[position] if codes[position] == UNDECIDED else -1
+    _row_windows(levels, depth, d, numbers[:3], rows, rises)
+    if middle and np.int64(w) * d <= FLOAT32_CELLS:
+        _middles_inside(tops, rows, rises, depth, w, d, out)
+        if margin == 0.0:
+            return 0
+        for position in range(codes.size):  # what lies outside is outside with a margin too
+            tops[position] = tops[position] if out[position] == INSIDE else -1
+    lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
+    unsure = 0
+    for position in range(codes.size):
+        if tops[position] < 0:
+            continue
+        for i in range(w):
+            cell = position + i * depth
+            contact = rows[cell] == tops[position]
+            lo[i] = (d - np.int64(rises[1, cell])) // 2 if contact else d
+            hi[i] = (d + np.int64(rises[0, cell])) // 2 - 1 if contact else -1
+        out[position] = inside(lo, hi, scratch[1], scratch[2], x, y, unit, margin, whole)
+        unsure += out[position] == UNSURE
+    return unsure
 
 
 @njit(cache=True)
@@ -241,31 +389,26 @@ def solve_undecided(
         The number of windows that are UNSURE.
     """
     width, depth = levels.shape
+    middle = whole and 2 * x == w * unit and 2 * y == d * unit
+    undecided = 0
+    positions = (width - w) * depth + depth - d + 1
+    for position in range(positions):
+        undecided += codes[position] == UNDECIDED
+    if undecided * w * d > READ_CELLS * width * depth:
+        return _solve_together(
+            codes[:positions], best, levels.reshape(width * depth), depth, w, d, x, y, unit, margin,
+            whole, middle, scratch, out.reshape(width * depth),
+        )  # fmt: skip
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
-    upper, lower = scratch[1], scratch[2]
-    middle = whole and margin == 0.0 and 2 * x == w * unit and 2 * y == d * unit
     unsure = 0
-    # Large windows come in clusters with the same level: mark its cells once, then look them up.
-    marks = np.empty((2, width, depth) if w * d > LOOKUP_CELLS else (2, 0, 0), np.int16)
-    next_y, previous_y = marks[0], marks[1]
-    marked = -1
-    for position in range((width - w) * depth + depth - d + 1):
+    for position in range(positions):
         if codes[position] != UNDECIDED:
             continue
         cx, cy = position // depth, position % depth
-        top = best[position]
-        if w * d > LOOKUP_CELLS:
-            if marked != top:
-                _mark_neighbours(levels, top, next_y, previous_y)
-                marked = top
-            for i in range(w):
-                lo[i] = next_y[cx + i, cy] - cy
-                hi[i] = previous_y[cx + i, cy + d - 1] - cy
-        else:
-            _level_extremes(levels, cx, cy, w, d, top, lo, hi)
-        if middle:
+        _level_extremes(levels, cx, cy, w, d, best[position], lo, hi)
+        if middle and margin == 0.0:
             out[cx, cy] = middle_inside(lo, hi, d)
         else:
-            out[cx, cy] = inside(lo, hi, upper, lower, x, y, unit, margin, whole)
+            out[cx, cy] = inside(lo, hi, scratch[1], scratch[2], x, y, unit, margin, whole)
             unsure += out[cx, cy] == UNSURE
     return unsure
