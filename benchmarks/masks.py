@@ -116,7 +116,7 @@ def rough(measured: Measurements) -> None:
     """Measure figure 5: one mask of a rough map, compared with that of a flat floor."""
     for side in (10, 40, 120):
         n = max(4, (1 << 14) // side**2)
-        length = side // 5
+        length = 3 * side // 10
         generator = torch.Generator().manual_seed(1)
         high = torch.rand((n, side, side), generator=generator) < 5 / length**2
         flat = empty(n, (side, side, side), 1)
