@@ -25,7 +25,7 @@ def _fused_layer() -> Callable[..., Tensor] | None:
     It includes the activation, and takes a third of the time of a layer and a ReLU. It is not a
     public part of PyTorch, so other versions may not have it.
     """
-    if not torch.backends.mkldnn.is_available():
+    if not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]  # torch's own
         return None
     operation: Callable[..., Tensor] | None
     operation = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
