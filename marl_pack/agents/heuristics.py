@@ -16,6 +16,7 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.candidates import Candidates
 from marl_pack.agents.keys import KEYS, ORIENTATION_AGENTS, POLICIES, Keys
 from marl_pack.agents.policy import (
+    InTurns,
     OrientationAgent,
     Placement,
     PlacementAgent,
@@ -54,6 +55,21 @@ class Heuristic:
         return (legal or game.moves).least(rank)
 
 
+@dataclass(frozen=True)
+class RandomPlay(InTurns):
+    """Two agents that choose at random; both choices of a turn are drawn in one call.
+
+    Args:
+        generator: of random numbers; torch's global generator by default.
+    """
+
+    generator: torch.Generator | None = None
+
+    def __call__(self, game: Packing) -> Placement:
+        """Return orientation and cell of each game, int64 [G] each."""
+        return draw_placement(game, self.generator)
+
+
 HEURISTICS: dict[str, Heuristic] = {name: Heuristic(keys) for name, keys in KEYS.items()}
 """Every heuristic by its name."""
 
@@ -75,7 +91,11 @@ def make_policy(name: str, seed: int | None = 0, device: torch.device | str = "c
     if name in HEURISTICS:
         return HEURISTICS[name]
     generator = _generator(seed, device)
-    return lambda game: draw_placement(game, generator)
+    return RandomPlay(
+        lambda game: draw(game.orientation_mask, generator),
+        lambda game, orientation: draw(game.mask, generator, orientation),
+        generator,
+    )
 
 
 def make_orientation_agent(

@@ -20,17 +20,26 @@ POSSIBLE, ILLEGAL, WRONG_ORIENTATION, FULL, OUTSIDE = range(5)
 
 
 @njit(cache=True, inline="always")
+def _any(cells: Any) -> bool:
+    """Return whether any cell is true; ``cells.any()`` takes longer to compile."""
+    some = False
+    for i in range(cells.size):
+        some |= cells[i]
+    return some
+
+
+@njit(cache=True, inline="always")
 def _legal(masks: Any, orientation_mask: Any, g: int, o: int, cell: int, masked: bool) -> bool:
     """Return whether a choice is legal; ``masked`` is false if orientations are not masked."""
     if not (0 <= o < masks.shape[1] and 0 <= cell < masks.shape[2]):
         return False
-    return masks[g, o, cell] or (not masked and orientation_mask[g, o] and not masks[g, o].any())
+    return masks[g, o, cell] or (not masked and orientation_mask[g, o] and not _any(masks[g, o]))
 
 
 @njit(cache=True, inline="always")
 def _has_cell(masks: Any, g: int, o: int, masked: bool) -> bool:
     """Return whether a chosen orientation has a legal cell; where it is masked, it has one."""
-    return masked or masks[g, o].any()
+    return masked or _any(masks[g, o])
 
 
 @njit(cache=True, nogil=True)
@@ -168,7 +177,7 @@ def find_choices(
     for g in range(alive.size):
         alive[g] = False
         for o in range(masks.shape[1]):
-            orientation_mask[g, o] = masks[g, o].any()
+            orientation_mask[g, o] = _any(masks[g, o])
             alive[g] |= orientation_mask[g, o]
         if not masked:
             for o in range(masks.shape[1]):

@@ -27,7 +27,14 @@ from torch import Tensor, from_numpy
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.installation import njit
 from marl_pack.stability.centres import CentreTable
-from marl_pack.stability.hull_exact import OUTSIDE, UNDECIDED, UNSURE, YES, solve_undecided
+from marl_pack.stability.hull_exact import (
+    OUTSIDE,
+    UNDECIDED,
+    UNSURE,
+    YES,
+    solve_middles,
+    solve_undecided,
+)
 from marl_pack.stability.mask_runs import earlier_equals, in_bin, runs_of_footprints
 
 RUN_CELLS = 1024
@@ -194,9 +201,9 @@ def _write_run(
     for j in range(batch.size):
         i = batch[j]
         if _write_mask(codes[j], flat_out[i]):
-            solve_undecided(
-                codes[j], tops[j * cells : (j + 1) * cells], levels[i // count], w, d, w / 2,
-                d / 2, 1.0, 0.0, True, scratch, out[i // count, i % count],
+            solve_middles(
+                codes[j], tops[j * cells : (j + 1) * cells], levels[i // count], w, d, scratch,
+                out[i // count, i % count],
             )  # fmt: skip
         if flat_best.size:
             _copy(tops[j * cells : (j + 1) * cells], flat_best[i])

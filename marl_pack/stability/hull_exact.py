@@ -239,6 +239,15 @@ def _in_contact(rows: Any, tops: Any, row: Any, start: Any, n: int) -> bool:
 
 
 @njit(cache=True)
+def _any_undecided(tops: Any, start: int, n: int) -> bool:
+    """Return whether any of n neighbouring windows is undecided."""
+    highest: Any = np.int32(-1)
+    for i in range(start, start + n):
+        highest = max(highest, tops[i])
+    return bool(highest >= 0)
+
+
+@njit(cache=True)
 def _steepen(
     rows: Any, rises: Any, tops: Any, row: Any, start: Any, n: int, near: Any, far: Any,
     steepest: Any,
@@ -290,7 +299,7 @@ def _middles_inside(tops: Any, rows: Any, rises: Any, depth: int, w: int, d: int
     steepest = np.empty((2, 2, AT_ONCE), np.float32)  # in each direction, left and right
     for start in range(0, tops.size, AT_ONCE):
         n = min(AT_ONCE, tops.size - start)
-        if tops[start : start + n].max() < 0:
+        if not _any_undecided(tops, start, n):
             continue
         steepest[:] = np.float32(-np.inf)
         for x in range(w):
@@ -330,6 +339,55 @@ def _level_extremes(
 
 
 @njit(cache=True)
+def _is_much(codes: Any, positions: int, window: int, cells: int) -> bool:
+    """Return whether the undecided windows have many more cells together than the map.
+
+    Args:
+        codes: uint8 [W · D], the windows' codes.
+        positions: number of codes to count.
+        window: cells of a window.
+        cells: cells of the map.
+    """
+    undecided = 0
+    for position in range(positions):
+        undecided += codes[position] == UNDECIDED
+    return undecided * window > READ_CELLS * cells
+
+
+@njit(cache=True)
+def _undecided_levels(codes: Any, best: Any, tops: Any) -> None:
+    """Write the largest K of each undecided window to ``tops`` int32 [P], -1 for the others."""
+    for position in range(tops.size):
+        tops[position] = best[position] if codes[position] == UNDECIDED else -1
+
+
+@njit(cache=True)
+def solve_middles(
+    codes: Any, best: Any, levels: Any, w: int, d: int, scratch: Any, out: Any
+) -> None:
+    """Write whether the middle of each UNDECIDED window lies inside the hull: OUTSIDE or INSIDE.
+
+    The arguments are those of :func:`solve_undecided`.
+    """
+    width, depth = levels.shape
+    cells, positions = width * depth, (width - w) * depth + depth - d + 1
+    exact = np.int64(w) * d <= FLOAT32_CELLS
+    if exact and _is_much(codes, positions, np.int64(w) * d, cells):
+        numbers, rises = np.empty((5, cells), np.int32), np.empty((2, cells), np.float32)
+        tops = numbers[4, :positions]
+        _undecided_levels(codes, best, tops)
+        _row_windows(levels.reshape(cells), depth, d, numbers[:3], numbers[3], rises)
+        _middles_inside(tops, numbers[3], rises, depth, w, d, out.reshape(cells))
+        return
+    lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
+    for position in range(positions):
+        if codes[position] == UNDECIDED:
+            x, y = position // depth, position % depth
+            _level_extremes(levels, x, y, w, d, best[position], lo, hi)
+            out[x, y] = middle_inside(lo, hi, d)
+
+
+@njit(cache=True)
 def _solve_together(
     codes: Any, best: Any, levels: Any, depth: int, w: int, d: int, x: float, y: float, unit: float,
     margin: float, whole: bool, middle: bool, scratch: Any, out: Any,
@@ -340,13 +398,10 @@ def _solve_together(
     """
     numbers, rises = np.empty((5, levels.size), np.int32), np.empty((2, levels.size), np.float32)
     rows, tops = numbers[3], numbers[4, : codes.size]
-    for position in range(codes.size):
-        tops[position] = best[position] if codes[position] == UNDECIDED else -1
+    _undecided_levels(codes, best, tops)
     _row_windows(levels, depth, d, numbers[:3], rows, rises)
     if middle and np.int64(w) * d <= FLOAT32_CELLS:
         _middles_inside(tops, rows, rises, depth, w, d, out)
-        if margin == 0.0:
-            return 0
         for position in range(codes.size):  # what lies outside is outside with a margin too
             tops[position] = tops[position] if out[position] == INSIDE else -1
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
@@ -390,11 +445,11 @@ def solve_undecided(
     """
     width, depth = levels.shape
     middle = whole and 2 * x == w * unit and 2 * y == d * unit
-    undecided = 0
+    if middle and margin == 0.0:
+        solve_middles(codes, best, levels, w, d, scratch, out)
+        return 0
     positions = (width - w) * depth + depth - d + 1
-    for position in range(positions):
-        undecided += codes[position] == UNDECIDED
-    if undecided * w * d > READ_CELLS * width * depth:
+    if _is_much(codes, positions, np.int64(w) * d, width * depth):
         return _solve_together(
             codes[:positions], best, levels.reshape(width * depth), depth, w, d, x, y, unit, margin,
             whole, middle, scratch, out.reshape(width * depth),
@@ -406,9 +461,6 @@ def solve_undecided(
             continue
         cx, cy = position // depth, position % depth
         _level_extremes(levels, cx, cy, w, d, best[position], lo, hi)
-        if middle and margin == 0.0:
-            out[cx, cy] = middle_inside(lo, hi, d)
-        else:
-            out[cx, cy] = inside(lo, hi, scratch[1], scratch[2], x, y, unit, margin, whole)
-            unsure += out[cx, cy] == UNSURE
+        out[cx, cy] = inside(lo, hi, scratch[1], scratch[2], x, y, unit, margin, whole)
+        unsure += out[cx, cy] == UNSURE
     return unsure

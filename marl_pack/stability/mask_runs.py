@@ -81,16 +81,18 @@ def runs_of_footprints(
     for i in range(masks):
         if key[i] >= 0:
             start[key[i] + 1] += 1
-    limits = [0]
+    limits, runs = np.zeros(masks + 1, np.int64), 0
     for k in range(start.size - 1):
         for cut in range(start[k] + size, start[k] + start[k + 1], size):
-            limits.append(cut)
+            runs += 1
+            limits[runs] = cut
         start[k + 1] += start[k]
-        if start[k + 1] > limits[-1]:
-            limits.append(start[k + 1])
+        if start[k + 1] > limits[runs]:
+            runs += 1
+            limits[runs] = start[k + 1]
     for i in range(masks):
         if key[i] >= 0:
             order[start[key[i]]] = i
             start[key[i]] += 1
             ordered += 1
-    return order[:ordered], np.array(limits)
+    return order[:ordered], limits[: runs + 1]

@@ -230,7 +230,8 @@ def _write_surfaces(heightmap: Any, placements: Any, height: int, surface: Any) 
             last = b
             bare[:] = 0
             _tally(heightmap[b], 0, 0, width, depth, tenths, 1, bare)
-        tally[:] = bare
+        for entry in range(SURFACE):  # an assignment of arrays takes seconds to compile
+            tally[entry] = bare[entry]
         # The box replaces the columns of its window, and levels the steps between them.
         _tally(heightmap[b], x, y, w, d, tenths, -1, tally)
         tally[tenths[z + h]] += w * d
