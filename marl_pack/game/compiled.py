@@ -22,10 +22,10 @@ POSSIBLE, ILLEGAL, WRONG_ORIENTATION, FULL, OUTSIDE = range(5)
 @njit(cache=True, inline="always")
 def _any(cells: Any) -> bool:
     """Return whether any cell is true; ``cells.any()`` takes longer to compile."""
-    some = False
+    result = False
     for i in range(cells.size):
-        some |= cells[i]
-    return some
+        result |= cells[i]
+    return result
 
 
 @njit(cache=True, inline="always")
