@@ -19,6 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import torch
 from filelock import FileLock
 
 from marl_pack.files import write_json
@@ -138,7 +139,7 @@ def reported() -> dict[str, Any]:
 def record(
     command: str, seeds: Sequence[int] = (), threads: int = 1, **more: Any
 ) -> dict[str, Any]:
-    """Return the record of a measurement: command, commit, CPU, threads, seeds, packages and date.
+    """Return the record of a measurement: command, commit, processors, seeds, packages and date.
 
     Args:
         command: the command that measures this row.
@@ -156,7 +157,8 @@ def record(
         "command": command, "commit": commit(), "cpu": cpu(), "cores": os.cpu_count(),
         "threads": threads, "seeds": ", ".join(map(str, seeds)),
         "packages": ", ".join(versions),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(), **more,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **({"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}), **more,
     }  # fmt: skip
 
 

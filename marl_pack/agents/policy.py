@@ -66,18 +66,23 @@ def draw(
     return code(mask, point, row)
 
 
-def draw_placement(game: Packing, generator: torch.Generator | None = None) -> Placement:
+def draw_placement(
+    game: Packing, generator: torch.Generator | None = None, points: Tensor | None = None
+) -> Placement:
     """Draw one of the orientations that may be chosen, then one of its legal cells, uniformly.
 
     Args:
         game: the games.
         generator: as for :func:`draw`.
+        points: float32 [2, G, 1], random numbers in [0, 1) for the orientations and the cells;
+            drawn from the generator by default.
 
     Returns:
         Orientation and cell, int64 [G] each.
     """
     device = game.mask.device
-    points = torch.rand(2, game.n, 1, generator=generator, device=device)
+    if points is None:
+        points = torch.rand(2, game.n, 1, generator=generator, device=device)
     code = default_backend(device).pick(compiled=_draw_pair_compiled, tensor=_draw_pair_tensor)
     return code(game.orientation_mask, game.mask, points)
 
