@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 from marl_pack.backend import Backend, default_backend
 from marl_pack.geometry import Size, check_size
 from marl_pack.geometry.compiled import place_box
-from marl_pack.geometry.tensor import footprint, place_boxes
+from marl_pack.geometry.tensor import divide, footprint, place_boxes
 from marl_pack.installation import njit
 
 UNKNOWN = -1
@@ -381,7 +381,7 @@ def _place_tensor(
     box = torch.cat((corners, resting_height[:, None], sides), 1).to(bins.boxes.dtype)
     centre = corners + sides[:, :2].double() / 2
     if com is not None:
-        centre = (corners * unit + com.double()) / unit
+        centre = divide(corners * unit + com.double(), unit)
     weight = volume.double() if weights is None else weights.double()
     load = torch.cat((weight[:, None], centre), 1)
     label = torch.full_like(corners, UNKNOWN) if labels is None else torch.stack(labels, 1)

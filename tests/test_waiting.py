@@ -92,6 +92,31 @@ def test_a_step_in_tensor_code_does_not_wait(rule: str, settings: dict[str, Any]
     assert counts == ({"tolist": 1} if rule == "lbcp" else {})
 
 
+class Divisions(TorchDispatchMode):
+    """Lists the Python numbers that tensors are divided by."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.numbers: set[float] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.overloadpacket.__name__ == "div" and not isinstance(args[1], Tensor):
+            self.numbers.add(args[1])
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("rule", ["hull_1", "hull_alpha", "area_ratio", "lbcp", "equilibrium"])
+def test_a_step_divides_alike_on_every_device(rule: str) -> None:
+    """On CUDA, a Python number's reciprocal is rounded first; that of a power of 2 is exact."""
+    with Divisions() as divisions:
+        assert torch.tensor([38.0]) / 10 > 3
+    assert divisions.numbers == {10}
+    _, step = steps(rule, CENTRE)
+    with Divisions() as divisions:
+        step()
+    assert divisions.numbers <= {2}
+
+
 @pytest.mark.parametrize("rule", ["hull_alpha", "area_ratio"])
 def test_a_step_needs_no_number_of_the_device(rule: str) -> None:
     """With fake tensors, which have no numbers, every read of a number raises an error."""

@@ -26,6 +26,15 @@ def oriented(items: Tensor) -> Tensor:
     return items[..., orientation_table(items.device)]
 
 
+def divide(values: Tensor, number: float) -> Tensor:
+    """Divide each value by a number, rounded once on every device.
+
+    On CUDA, torch multiplies by the reciprocal of a Python number, which rounds twice: 38 / 10
+    becomes 3.8000000000000003.
+    """
+    return values / torch.full((), number, dtype=values.dtype, device=values.device)
+
+
 def footprint(width: int, depth: int, sides: Tensor, corners: Tensor) -> Tensor:
     """Return which columns lie under each box, bool [N, W, D].
 

@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from marl_pack.geometry.tensor import divide
+
 Offsets = tuple[tuple[float, float], ...]
 """For each of A orientations: x and y of the centre of mass minus those of the geometric centre, as
 fractions of the sides w and d after the item is rotated."""
@@ -61,7 +63,7 @@ class CentreTable:
 
     def cells(self, sides: Tensor) -> Tensor:
         """Return the centres in cells, float64 [N, A, 2], of items with ``sides`` [N, A, 3]."""
-        return self.units(sides) / self.unit
+        return divide(self.units(sides), self.unit)
 
     def units(self, sides: Tensor) -> Tensor:
         """Return the centres in units, float64 [N, A, 2], of items with ``sides`` [N, A, 3]."""

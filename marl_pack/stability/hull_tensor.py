@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from marl_pack.geometry import MAX_HEIGHT
-from marl_pack.geometry.tensor import bins_last, cut_windows, shift, slide
+from marl_pack.geometry.tensor import bins_last, cut_windows, divide, shift, slide
 from marl_pack.stability.centres import CentreTable, centre_table
 from marl_pack.stability.hull_exact import ROUNDING
 
@@ -233,7 +233,7 @@ def _surrounded(levels: Tensor, best: Tensor, windows: _Windows, height: int) ->
         (w, d), (cx, cy) = windows.sides[..., part], windows.middle[..., part]
         rows = slide((levels[..., part].to(whole) * gap + high).to(whole), d, 2, depth)
         corners = torch.maximum(rows[:, :-1], rows[:, 1:])  # at x = 1 … W - 1
-        begin = (cx / unit).floor().long()  # the row of the first corner on the right
+        begin = divide(cx, unit).floor().long()  # the row of the first corner on the right
         right_of = shift(corners, begin, 1, width - 1).to(dtype)
         last = shift(rows, w - 1, 1, width - 1).to(dtype)
         rows, corners = rows.to(dtype), corners.to(dtype)
