@@ -110,7 +110,7 @@ def captured(measured: Measurements, n: int, seconds: float = 1.0) -> None:
     game, other = Packing(n, device="cuda"), Packing(n, device="cuda")
     points = torch.rand(2, n, 1, device="cuda")
     torch.cuda.synchronize()  # the stream below must not begin before the games are ready
-    stream = torch.cuda.Stream()
+    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]  # torch has no type for it
     with torch.cuda.stream(stream):
         for _ in range(3):
             step_and_store(game, points)

@@ -130,15 +130,17 @@ def main() -> None:
     torch.set_num_threads(1)
     for device in devices():
         rows = [
-            (f"{config}, N = {bins:,}", config, f"--ppo.num_envs={bins}")
+            (f"{config}, N = {bins:,}", config, [f"--ppo.num_envs={bins}"])
             for config in TRAINED
             for bins in ((256, 1024) if device == "cpu" else (4096, 16384))
         ]
-        rows.append(("default", "default", "--ppo.precision=float32"))
+        many = [] if device == "cpu" else ["--ppo.num_envs=4096"]
+        default = "default, N = 4,096" if many else "default"
+        rows.append((default, "default", ["--ppo.precision=float32", *many]))
         if fast_precision("bfloat16", device):
-            rows.append(("default, bfloat16", "default", "--ppo.precision=bfloat16"))
-        for name, config, option in rows:
-            rate, shares = measure(config, device, chosen.seconds, option)
+            rows.append((f"{default}, bfloat16", "default", ["--ppo.precision=bfloat16", *many]))
+        for name, config, options in rows:
+            rate, shares = measure(config, device, chosen.seconds, *options)
             measured.keep(f"{name}, {device}", items_per_second=rate, **shares)
 
 

@@ -125,16 +125,17 @@ def utilization(row: Mapping[str, Any]) -> str:
 
 
 def made(table: Results) -> str:
-    """Return the command of a table, and the CPUs, seeds, commits and dates of its rows."""
+    """Return the command of a table, and the processors, seeds, commits and dates of its rows."""
     records = [row["record"] for row in table.rows().values()]
 
     def all_of(name: str) -> str:
-        return ", ".join(sorted({str(r[name]) for r in records}))
+        return ", ".join(sorted({str(r[name]) for r in records if name in r}))
 
     seeds = sorted({seed for r in records for seed in r["seeds"].split(", ") if seed})
     threads = all_of("threads")
     words = [
         all_of("cpu"),
+        *([all_of("gpu")] if any("gpu" in r for r in records) else []),
         f"{threads} thread" + "s" * (threads != "1"),
         *([f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}"] if seeds else []),
         f"commit {all_of('commit')}",
