@@ -16,14 +16,9 @@ import torch
 
 from benchmarks.record import Measurements
 from benchmarks.timing import best_time, devices
-from marl_pack.agents.afterstates.afterstates import (
-    Afterstates,
-    afterstates_by_compiled_loops,
-    afterstates_of,
-    count_by_masks,
-    probe_lengths,
-)
+from marl_pack.agents.afterstates.afterstates import afterstates_of, probe_lengths
 from marl_pack.agents.afterstates.bitboards import fit_in_words
+from marl_pack.agents.afterstates.compiled import compute_compiled, count_by_masks
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.player import load
@@ -31,9 +26,7 @@ from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
 
 
-def seconds(
-    code: Callable[..., Afterstates], game: Packing, backend: Backend, device: str
-) -> float:
+def seconds(code: Callable[..., object], game: Packing, backend: Backend, device: str) -> float:
     """Return the seconds that one call takes for the visible items of a game."""
     bins = replace(game.bins.to(device), backend=backend)
     sides = game.orient_item(game.items).sides.to(device)
@@ -52,7 +45,7 @@ def main() -> None:
         for _ in range(6):
             game.place(*policy(game))
         placements = len(Lookahead().afterstates(game).counts)
-        by_masks = partial(afterstates_by_compiled_loops, count_cells=count_by_masks)
+        by_masks = partial(compute_compiled, count_cells=count_by_masks)
         masks = seconds(by_masks, game, Backend.COMPILED, "cpu")
         timings = [("compiled masks", "cpu", masks)]
         if fit_in_words(*size[:2]):

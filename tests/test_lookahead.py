@@ -10,17 +10,17 @@ import torch
 from conftest import in_play
 from test_backends import GAMES
 
-from marl_pack.agents.afterstates.afterstates import (
-    PER_THREAD,
-    Afterstates,
-    afterstates_by_compiled_loops,
-    afterstates_of,
-    count_by_masks,
-    probe_lengths,
-)
+from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of, probe_lengths
 from marl_pack.agents.afterstates.bitboards import count_by_bits, fit_in_words
+from marl_pack.agents.afterstates.compiled import (
+    PER_THREAD,
+    compute_compiled,
+    count_by_masks,
+    probability_compiled,
+)
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.afterstates.sampled import sampled_afterstates, samples
+from marl_pack.agents.afterstates.tensor import probability_tensor
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.backend import Backend
 from marl_pack.game.packing import Packing
@@ -67,6 +67,27 @@ def test_feasible_cells_and_probability_equal_the_reference(
     assert not probability[~game.mask].any()
 
 
+@pytest.mark.parametrize("lengths", [1, 4, 5])
+@pytest.mark.parametrize("orientations", [(0, 1, 2, 3, 4, 5), (0, 1), (4,)])
+def test_the_probability_counts_every_box(lengths: int, orientations: tuple[int, ...]) -> None:
+    """The boxes are sets of bits: 4 lengths fill one word, 5 lengths need two."""
+    generator = torch.Generator().manual_seed(lengths)
+    counts = torch.randint(0, 3, (200, *[lengths] * 3), generator=generator, dtype=torch.int32)
+    counts *= torch.rand(200, 1, 1, 1, generator=generator) > torch.rand(
+        counts.shape, generator=generator
+    )
+    axes = [ORIENTATIONS[o] for o in orientations]
+    expected = [
+        np.mean([
+            any(row[tuple(box[k] for k in way)] for way in axes)
+            for box in product(range(lengths), repeat=3)
+        ])
+        for row in counts.numpy()
+    ]  # fmt: skip
+    for compute in (probability_compiled, probability_tensor):
+        np.testing.assert_allclose(compute(counts, axes), expected, rtol=1e-6)
+
+
 def maps(afterstates: Afterstates, game: Packing) -> list[torch.Tensor]:
     """Every value of each placement, on the bins' maps."""
     rows = [
@@ -87,7 +108,7 @@ def test_sets_of_bits_count_what_masks_count(settings: dict[str, object]) -> Non
     game = in_play(64, 12, **settings)
     assert fit_in_words(*game.size[:2])
     bits, masks = (
-        afterstates_by_compiled_loops(*arguments_of(game), count_cells=code).counts
+        compute_compiled(*arguments_of(game), count_cells=code)[1]
         for code in (count_by_bits, count_by_masks)
     )
     assert torch.equal(bits, masks)

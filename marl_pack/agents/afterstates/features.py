@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from marl_pack.agents.afterstates.afterstates import SURFACE, Afterstates
-from marl_pack.agents.afterstates.limits import MOST_LENGTHS
+from marl_pack.agents.afterstates.afterstates import Afterstates
+from marl_pack.agents.afterstates.limits import MOST_LENGTHS, SURFACE
 from marl_pack.installation import njit
 
 PAIRS = MOST_LENGTHS * (MOST_LENGTHS + 1) // 2
