@@ -42,7 +42,10 @@ class _Compiling:
     def announce(cls) -> None:
         """Show the message unless it was shown before."""
         if cls.say is not None:
-            cls.say("compiling code: this takes about 20 seconds, at the first start only")
+            cls.say(
+                "compiling code: this takes about 20 seconds, at the first start only "
+                "(marl-pack compile does it ahead of time)"
+            )
             cls.say = None
 
 

@@ -18,8 +18,8 @@ LAYERS = (
     ("env_aec", "vec_env", "agents"),
     ("evaluation",),
     # The programs, and what only they use.
-    ("cli", "config", "evaluate", "export", "integrations", "options", "physics", "play", "players",
-     "train", "training"),
+    ("cli", "compile", "config", "evaluate", "export", "integrations", "options", "physics", "play",
+     "players", "train", "training"),
 )  # fmt: skip
 
 # What the judge and the environment must not need.
