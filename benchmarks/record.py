@@ -31,6 +31,7 @@ MEASURED = ("marl_pack", "models/*.pt", "configs")
 """The files that figures depend on, besides the code of the commands."""
 PROGRAMS = {
     "packing": "experiments.packing --tables packing",
+    "two_orientations": "experiments.packing --tables two_orientations",
     "other_rules": "experiments.packing --tables other_rules",
     "bodies": "experiments.packing --tables bodies",
     **{name: f"experiments.{name}" for name in (

@@ -1,9 +1,10 @@
 """Measure how well policies pack: ``python -m experiments.packing``.
 
-There are three tables: ``packing`` has policies on four sets of items; ``other_rules`` has
-heuristics under every stability rule; ``bodies`` shows what falls in physics if a rule's
-assumptions do not hold. Each row is one command ``evaluate``. With ``--physics`` the packings are
-judged too, which takes most of the time; the packings of ``bodies`` are always judged.
+There are four tables: ``packing`` has policies on four sets of items; ``two_orientations`` has
+policies that may only rotate items about the vertical; ``other_rules`` has heuristics under every
+stability rule; ``bodies`` shows what falls in physics if a rule's assumptions do not hold. Each row
+is one command ``evaluate``. With ``--physics`` the packings are judged too, which takes most of the
+time; the packings of ``bodies`` are always judged.
 """
 
 from __future__ import annotations
@@ -41,12 +42,22 @@ MODELS = {
     "CUT-2": ("rs", "cut_2", "plain"),
     "125 types": ("rs", "types125"),
 }
+UPRIGHT = {
+    "RS": ("rs_upright", "rs_upright --plan rollouts=16,top=4,depth=2", "rs"),
+    "125 types": (
+        "types125_upright", "types125_upright --plan rollouts=16,top=4,depth=2", "types125"),
+}  # fmt: skip
 HEURISTICS = ("max_feasible", "dblf", "height_min", "best_fit", "random")
 TABLES = {
     "packing": [
         f"--policy {policy} {items}"
         for name, items in SETS.items()
         for policy in (*MODELS[name], *HEURISTICS)
+    ],
+    "two_orientations": [
+        f"--policy {policy} {SETS[name]} --orientations 0 1"
+        for name, policies in UPRIGHT.items()
+        for policy in (*policies, *HEURISTICS)
     ],
     "other_rules": [
         f"--policy {policy} {SETS['RS']} --rule {rule}"
