@@ -42,11 +42,12 @@ MODELS = {
     "CUT-2": ("rs", "cut_2", "plain"),
     "125 types": ("rs", "types125"),
 }
+UPRIGHT_SETS = {name: f"{SETS[name]} --orientations 0 1" for name in ("RS", "125 types")}
+UPRIGHT_PLAN = "--plan rollouts=16,top=4,depth=2"
 UPRIGHT = {
-    "RS": ("rs_upright", "rs_upright --plan rollouts=16,top=4,depth=2", "rs"),
-    "125 types": (
-        "types125_upright", "types125_upright --plan rollouts=16,top=4,depth=2", "types125"),
-}  # fmt: skip
+    "RS": ("rs_upright", f"rs_upright {UPRIGHT_PLAN}", "rs"),
+    "125 types": ("types125_upright", f"types125_upright {UPRIGHT_PLAN}", "types125"),
+}
 HEURISTICS = ("max_feasible", "dblf", "height_min", "best_fit", "random")
 TABLES = {
     "packing": [
@@ -55,7 +56,7 @@ TABLES = {
         for policy in (*MODELS[name], *HEURISTICS)
     ],
     "two_orientations": [
-        f"--policy {policy} {SETS[name]} --orientations 0 1"
+        f"--policy {policy} {UPRIGHT_SETS[name]}"
         for name, policies in UPRIGHT.items()
         for policy in (*policies, *HEURISTICS)
     ],

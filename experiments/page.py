@@ -9,7 +9,7 @@ programs of ``experiments/`` and ``benchmarks/`` write.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,6 +38,16 @@ POLICIES = {
     **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
 }
 """The names of the rows of the first table."""
+UPRIGHT = {
+    "rs_upright": "`rs_upright`, trained on RS",
+    f"rs_upright {packing.UPRIGHT_PLAN}": f"the same with `{packing.UPRIGHT_PLAN}`",
+    "types125_upright": "`types125_upright`, trained on 125 types",
+    f"types125_upright {packing.UPRIGHT_PLAN}": f"the same with `{packing.UPRIGHT_PLAN}`",
+    RS: "`rs`, trained with six orientations",
+    "types125": "`types125`, trained with six orientations",
+    **{name: f"heuristic `{name}`" for name in packing.HEURISTICS},
+}
+"""The names of the rows of the table of two orientations."""
 
 
 def render(folder: Path = RESULTS) -> str:
@@ -69,8 +79,14 @@ def render(folder: Path = RESULTS) -> str:
             tables["training"].rows().items(), key=lambda row: row[1]["items_per_second"]
         ),
         made=lambda name: made(tables[name]),
-        packing_table=packing_table(tables["packing"]),
+        packing_table=packing_table(
+            tables["packing"], POLICIES, packing.SETS, packing.MODELS
+        ),
+        upright_table=packing_table(
+            tables["two_orientations"], UPRIGHT, packing.UPRIGHT_SETS, packing.UPRIGHT
+        ),
         sets=packing.SETS,
+        upright_sets=packing.UPRIGHT_SETS,
         rs=tables["packing"].row(f"--policy {RS} {packing.SETS['RS']}"),
         symmetric=tables["packing"].row(f"--policy {RS} --symmetric {packing.SETS['RS']}"),
         rs_items=packing.SETS["RS"],
@@ -144,14 +160,26 @@ def made(table: Results) -> str:
     return f"`{made_by(table.name)}` ({', '.join(words)})"
 
 
-def packing_table(table: Results) -> list[dict[str, Any]]:
-    """Return a row for each policy: utilization by set, equilibrium and falls over all sets."""
+def packing_table(
+    table: Results,
+    policies: Mapping[str, str],
+    sets: Mapping[str, str],
+    models: Mapping[str, Sequence[str]],
+) -> list[dict[str, Any]]:
+    """Return a row for each policy: utilization by set, equilibrium and falls over all sets.
+
+    Args:
+        table: the table of the figures.
+        policies: the names of the rows, by the option ``--policy``.
+        sets: the other options of each set of items, by its name.
+        models: the learned agents that play each set; all heuristics play all sets.
+    """
     lines = []
-    for policy, name in POLICIES.items():
+    for policy, name in policies.items():
         rows = {
             items: table.row(f"--policy {policy} {options}")
-            for items, options in packing.SETS.items()
-            if policy in (*packing.MODELS[items], *packing.HEURISTICS)
+            for items, options in sets.items()
+            if policy in (*models[items], *packing.HEURISTICS)
         }
         lines.append({
             "name": name,

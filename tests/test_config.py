@@ -75,7 +75,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
 
 
 @pytest.mark.parametrize(("options", "expected"), [
-    (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: clip"),
+    (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: afterstate_ramp"),
     (["--sed=1"], r"unknown key 'sed'; did you mean 'seed'\? Keys: device, evaluation"),
     (["--ppo.gamma=much"], r"^ppo\.gamma = much: needs a number$"),
     (["--game.rule=hull"], r"game: unknown stability rule 'hull': needs one of hull_1, hull_alpha"),
@@ -112,6 +112,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.teacher=dblf"], r"placement\.teacher_iterations = 0: needs a number from 1"),
     (["--placement.teacher_iterations=-1"], r"teacher_iterations = -1: needs placement"),
     (["--placement.teacher_iterations=5"], r"= 5: needs placement\.teacher"),
+    (["--ppo.afterstate_ramp=[5,2]"], r"afterstate_ramp = \[5, 2\]: needs two iterations in order"),
     (["--placement.teacher_random=1.5"], r"teacher_random = 1.5: needs a number from 0 to 1"),
     (["--orientation.teacher=first", "--orientation.teacher_iterations=5",
       "--orientation.frozen=true", "--orientation.policy=dblf"], r"a frozen agent does not learn"),

@@ -139,6 +139,17 @@ def test_the_command_writes_every_learned_agent(
     assert capsys.readouterr().err == "python -m marl_pack.export: interrupted\n"
 
 
+def test_agents_that_do_not_yet_observe_full_values_are_not_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = f"--output.folder={tmp_path}", "--output.name=run", "--ppo.afterstate_ramp=[0,100]"
+    assert train([*SMALL, *options, "--placement.network.planes=[afterstate_value]"]) == 0
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "run")])
+    assert ended.value.code == 2
+    assert "of the values of afterstates so far" in capsys.readouterr().err
+
+
 def test_a_frozen_networks_own_critic_is_written_beside_the_runs(tmp_path: Path) -> None:
     run, folder = "--output.name=run", f"--output.folder={tmp_path}"
     planes = "--placement.network.planes=[afterstate_value]"

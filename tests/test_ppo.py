@@ -11,11 +11,13 @@ from small_runs import recorded_game, rollout, same, tiny, weights
 from tensordict import TensorDict
 from torch import Tensor
 
+from marl_pack.agents.afterstates.limits import ILLEGAL
+from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.runner import RunInterruptedError
 from marl_pack.agents.loading import Loader
-from marl_pack.agents.networks.kinds import observe
+from marl_pack.agents.networks.kinds import TWO_AGENTS, observe
 from marl_pack.agents.policy import Policy
 from marl_pack.config import Config
 from marl_pack.evaluation.rollout import play
@@ -224,6 +226,32 @@ def test_a_frozen_heuristic_plays_and_the_other_agent_learns(options: tuple[str,
     assert agents[frozen.pop()] == {"name": options[1].partition("=")[2]}
 
 
+def test_values_of_afterstates_grow_over_the_ramp_in_training_and_in_checkpoints(
+    tmp_path: Path,
+) -> None:
+    """Agents that are loaded observe the share that they observed last, also as frozen agents."""
+    planes = [f"--{name}.network.planes=[mask,afterstate_value]" for name in TWO_AGENTS]
+    runner = make_runner(tiny(*planes, "--ppo.afterstate_ramp=[1,4]"), None)
+    loader, path, shares = Loader(), tmp_path / "run.pt", []
+    for iterations in range(1, 6):
+        shares.append(runner.alg.lookahead.value_share)
+        runner.train(iterations)
+    assert shares == pytest.approx([0, 0, 1 / 3, 2 / 3, 1])
+    runner = make_runner(tiny(*planes, "--ppo.afterstate_ramp=[1,5]"), None)
+    runner.train(2)
+    checkpoints.write(path, runner.checkpoint())
+    agent = loader.orientation_agent(str(path))
+    assert isinstance(agent, LearnedAgent)
+    game, full = Packing(4, (4, 4, 4), sides=(1, 3)), Lookahead(agent.lookahead.critic)
+    values, expected = agent.lookahead.afterstate_value(game), full.afterstate_value(game)
+    assert torch.allclose(values[game.mask], expected[game.mask] / 4)
+    assert (values[~game.mask] == ILLEGAL).all()
+    other = make_runner(tiny("--placement.frozen=true", f"--placement.policy={path}"), None)
+    other.train(1)
+    record = checkpoints.agent_record(other.checkpoint(), "placement")
+    assert record["value_share"] == 1 / 4
+
+
 @pytest.mark.parametrize("frozen", ["orientation", "placement"])
 def test_a_frozen_networks_weights_do_not_move_and_the_others_do(
     frozen: str, tmp_path: Path
@@ -288,7 +316,8 @@ def test_how_often_a_run_is_evaluated_does_not_change_its_weights(tmp_path: Path
     (), ("--joint=true",), ("--orientation.frozen=true", "--orientation.policy=random"),
     ("--ppo.schedule=adaptive", "--game.items=cut2"),
     ("--orientation.network.planes=[mask,afterstate_value]",
-     "--placement.network.planes=[afterstate_value,feasible_cells]"),
+     "--placement.network.planes=[afterstate_value,feasible_cells]",
+     "--ppo.afterstate_ramp=[1,4]"),
     ("--orientation.teacher=random", "--orientation.teacher_iterations=4"),
 ])  # fmt: skip
 def test_a_resumed_run_gives_the_weights_of_one_never_stopped(

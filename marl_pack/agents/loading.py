@@ -164,7 +164,8 @@ class Loader:
         for critic_weights, lookahead in self._lookaheads:
             if critic_weights is weights:
                 return lookahead
-        lookahead = Lookahead(load_afterstate_critic(record, self.device), self.memo)
+        critic = load_afterstate_critic(record, self.device)
+        lookahead = Lookahead(critic, self.memo, record.get("value_share", 1.0))
         self._lookaheads.append((weights, lookahead))
         return lookahead
 

@@ -91,6 +91,9 @@ def check(config: Config) -> None:
 def check_ppo(config: Config) -> None:
     """Refuse impossible combinations of the settings under ``ppo:``."""
     ppo = config.ppo
+    first, last = ppo.afterstate_ramp
+    if not 0 <= first <= last:
+        refuse("ppo.afterstate_ramp", [first, last], "needs two iterations in order, 0 or more")
     if 2 * ppo.num_mini_batches > ppo.num_envs * ppo.num_steps_per_env:
         refuse(
             "ppo.num_mini_batches", ppo.num_mini_batches,

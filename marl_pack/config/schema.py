@@ -98,6 +98,8 @@ class PPO:
         optimizer: name of torch's optimiser.
         precision: numbers in the convolutions of training: float32; or bfloat16, faster on
             processors with instructions for it (AVX512-BF16, AMX) and on GPUs.
+        afterstate_ramp: iterations between which the values of afterstates that agents observe grow
+            from 0 to full size.
     """
 
     num_envs: int = 64
@@ -119,6 +121,7 @@ class PPO:
     normalize_advantage_per_mini_batch: bool = False
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
     precision: Literal["float32", "bfloat16"] = "float32"
+    afterstate_ramp: tuple[int, int] = (0, 0)
 
 
 @dataclass

@@ -278,6 +278,11 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
         checkpoints.write(path, slim)
         console.print(f"{path}: a checkpoint to publish, {path.stat().st_size:,} bytes")
         return
+    if (share := checkpoints.value_share(checkpoint)) < 1:
+        raise ValueError(
+            f"{source}: the agents observe {share:.0%} of the values of afterstates so far; export "
+            "them after the last iteration of ppo.afterstate_ramp"
+        )
     training = training_facts(checkpoint)
     for name, agent in checkpoint["agents"].items():
         learned = "critic_state_dict" in agent

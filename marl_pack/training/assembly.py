@@ -131,7 +131,7 @@ def runner_settings(
     ppo = asdict(config.ppo)
     steps, iterations = ppo.pop("num_steps_per_env"), ppo.pop("max_iterations")
     final_entropy, schedule = ppo.pop("final_entropy_coef"), ppo.pop("schedule")
-    precision = ppo.pop("precision")
+    precision, ramp = ppo.pop("precision"), ppo.pop("afterstate_ramp")
     ppo.pop("num_envs")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
@@ -162,6 +162,7 @@ def runner_settings(
         "logger": logger,
         "algorithm": {
             "class_name": "marl_pack.agents.learning.ppo:PackingPPO", "iterations": iterations,
+            "afterstate_ramp": ramp,
         },
         "agents": {
             name: {"record": frozen[name]} if name in frozen else learner(name, agent)

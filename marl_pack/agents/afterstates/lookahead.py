@@ -6,7 +6,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 import torch
@@ -56,6 +56,19 @@ class Memo:
             self._turn = branched.turn
 
 
+def value_share_at(ramp: Sequence[int], iteration: int) -> float:
+    """Return the share of the values of afterstates that agents observe during training.
+
+    At first the critic knows little, and agents that trust it may settle for a worse way to play.
+
+    Args:
+        ramp: first and last iteration of the time in which the share grows from 0 to 1.
+        iteration: number of iterations done.
+    """
+    first, last = ramp
+    return 1.0 if iteration >= last else max(0.0, (iteration - first) / max(1, last - first))
+
+
 class Value(Protocol):
     """A critic of afterstates: features [K, F] → the return still to come [K]."""
 
@@ -72,11 +85,15 @@ class Lookahead:
     Args:
         critic: estimates the values of afterstates; None if no agent observes them.
         memo: stores the results; shared by players of the same games.
+        value_share: the values are multiplied by it, see :func:`value_share_at`.
     """
 
-    def __init__(self, critic: Value | None = None, memo: Memo | None = None) -> None:
+    def __init__(
+        self, critic: Value | None = None, memo: Memo | None = None, value_share: float = 1.0
+    ) -> None:
         self.critic = critic
         self.memo = memo or Memo()
+        self.value_share = value_share
 
     def afterstates(self, game: Packing) -> Afterstates:
         """Compute the afterstate of each legal placement."""
@@ -142,8 +159,8 @@ class Lookahead:
             ]
             gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
             reward = (gain - loss) / game.volume
-            value = torch.cat(values)[:count]
-            return afterstates.as_map((reward + value).float(), game.mask, ILLEGAL)
+            value = (reward + torch.cat(values)[:count]) * self.value_share
+            return afterstates.as_map(value.float(), game.mask, ILLEGAL)
 
         return self.memo.once(game, ("afterstate_value", critic), compute)
 

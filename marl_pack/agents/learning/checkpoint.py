@@ -31,6 +31,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from marl_pack.agents.afterstates.lookahead import value_share_at
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.learning import migration
 from marl_pack.agents.learning.form import (
@@ -62,7 +63,7 @@ _NETWORK = {"planes": [str]}
 _OPTIMIZER = {"state": {int: {str: (Tensor, NOTHING)}}, "param_groups": [{"params": [int]}]}
 _AGENT: dict[str, Any] = {
     "name": str, "network": _NETWORK, "actor_state_dict": _WEIGHTS, "critic_state_dict": _WEIGHTS,
-    "optimizer_state_dict": _OPTIMIZER, "afterstate_critic": _WEIGHTS,
+    "optimizer_state_dict": _OPTIMIZER, "afterstate_critic": _WEIGHTS, "value_share": float,
 }  # fmt: skip
 _AGENT |= {"teacher": _AGENT, "imitated": _AGENT}
 _SETTINGS = dict.fromkeys(("policy", "teacher", "imitate"), (str, NOTHING)) | {"network": _NETWORK}
@@ -71,7 +72,7 @@ FORM = {
     "config": {
         "seed": int,
         "game": {"bin": [int, int, int], "items": str, "sides": [int, int]},
-        "ppo": {"gamma": float},
+        "ppo": {"gamma": float, "afterstate_ramp": [int, int]},
         "orientation": _SETTINGS, "placement": _SETTINGS,
     },
     "agents": dict.fromkeys(AGENT_KINDS, _AGENT),
@@ -186,7 +187,8 @@ def without_training(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     of its settings is left out too, because it names folders of the run.
     """
     fields = ("format", "marl_pack", "config", "afterstate_critic", "iter", "items", "seconds")
-    parts = ("name", "network", "actor_state_dict", "critic_state_dict", "afterstate_critic")
+    parts = ("name", "network", "actor_state_dict", "critic_state_dict", "afterstate_critic",
+             "value_share")  # fmt: skip
     agents = {
         name: {part: agent[part] for part in parts if part in agent}
         for name, agent in checkpoint["agents"].items()
@@ -220,14 +222,22 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
         ValueError: if there is no such agent, or the critic whose values it observes is missing.
     """
     agent = agent_of(checkpoint, name)
-    parts = ("name", "network", "actor_state_dict", "afterstate_critic")
+    parts = ("name", "network", "actor_state_dict", "afterstate_critic", "value_share")
     record = {key: value for key, value in agent.items() if key in parts}
     sees_values = need_critic(record.get("network", {}).get("planes", ()))
     if sees_values and "afterstate_critic" not in record:
         if "afterstate_critic" not in checkpoint:
             raise ValueError(f"the {name} agent observes values: afterstate_critic is missing")
         record["afterstate_critic"] = checkpoint["afterstate_critic"]
+        record["value_share"] = value_share(checkpoint)
     return record
+
+
+def value_share(checkpoint: Mapping[str, Any]) -> float:
+    """Return the share of the values of afterstates that the agents observed last in training."""
+    ramp = checkpoint["config"].get("ppo", {}).get("afterstate_ramp", (0, 0))
+    done = checkpoint.get("schedule_iteration", checkpoint["iter"] + 1)  # published without it
+    return value_share_at(ramp, done)
 
 
 def check_weights(record: Mapping[str, Any], name: str) -> Network:

@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
-from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.afterstates.lookahead import Lookahead, value_share_at
 from marl_pack.agents.learning.cloning import Teacher
 from marl_pack.agents.networks.actor_critic import Actor, Critic
 from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
@@ -109,6 +109,7 @@ class PackingPPO:
         lookahead: computes afterstates and their values; shared by all learners.
         iterations: number of iterations of the run, for the schedules.
         afterstates: fits the critic of afterstates; None if no agent observes its values.
+        afterstate_ramp: see :func:`marl_pack.agents.afterstates.lookahead.value_share_at`.
 
     Raises:
         ValueError: if no agent learns.
@@ -123,15 +124,23 @@ class PackingPPO:
         lookahead: Lookahead,
         iterations: int,
         afterstates: AfterstateLearner | None = None,
+        afterstate_ramp: Sequence[int] = (0, 0),
     ) -> None:
         self.seats = list(seats)
         self.learners = {seat.kind.name: seat.ppo for seat in self.seats if seat.ppo is not None}
         if not self.learners:
             raise ValueError("both agents are frozen: nothing would learn")
         self.env, self.lookahead = env, lookahead
-        self.iterations, self.iteration = iterations, 0
+        self.iterations, self.afterstate_ramp = iterations, afterstate_ramp
         self.afterstates = afterstates
+        self._set_iteration(0)
         self._last: TensorDict | None = None  # the observation after the rollout
+
+    def _set_iteration(self, iteration: int) -> None:
+        """Store the number of iterations done, and set what depends on it."""
+        self.iteration = iteration
+        self.lookahead.value_share = value_share_at(self.afterstate_ramp, iteration)
+        self.lookahead.forget_values()
 
     @property
     def _learning(self) -> list[Seat]:
@@ -221,7 +230,7 @@ class PackingPPO:
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
             losses[f"{name}/kl"] = self._divergence(ppo)
             losses[f"{name}/learning_rate"] = ppo.learning_rate
-        self.iteration += 1
+        self._set_iteration(self.iteration + 1)
         if self.afterstates is not None and self._last is not None:
             with torch.inference_mode():  # it has values from before this update
                 self._last.update_(self.env.get_observations())
@@ -298,10 +307,10 @@ class PackingPPO:
         load_iteration = True
         for name, ppo in self.learners.items():
             load_iteration = ppo.load(loaded_dict["learners"][name], load_cfg, strict)
-        self.iteration = loaded_dict["schedule_iteration"]
         if self.afterstates is not None:
             self.load_afterstate_critic(loaded_dict["afterstate_critic"])
             self.afterstates.optimizer.load_state_dict(loaded_dict["afterstate_optimizer"])
+        self._set_iteration(loaded_dict["schedule_iteration"])
         return load_iteration
 
     def load_afterstate_critic(self, weights: Mapping[str, Tensor]) -> None:
@@ -319,8 +328,9 @@ class PackingPPO:
         Args:
             obs: an example of an observation.
             env: the games.
-            cfg: the configuration. ``algorithm`` has ``iterations``, ``lookahead``, ``frozen`` and
-                ``teachers`` (both: agents by name, callables as in :class:`Seat`). ``agents`` has
+            cfg: the configuration. ``algorithm`` has ``iterations``, ``afterstate_ramp``,
+                ``lookahead``, ``frozen`` and ``teachers`` (both: agents by name, callables as in
+                :class:`Seat`). ``agents`` has
                 for each learner ``network``, ``precision``, ``algorithm`` (settings of rsl_rl's
                 PPO), ``schedule``, ``teacher_iterations`` and ``teacher_random``.
             device: the device of the networks.
@@ -355,7 +365,8 @@ class PackingPPO:
             afterstates = AfterstateLearner(
                 lookahead.critic, lookahead, cfg["num_steps_per_env"], env.num_envs
             )
-        return PackingPPO(seats, env, lookahead, algorithm["iterations"], afterstates)
+        ramp = algorithm["afterstate_ramp"]
+        return PackingPPO(seats, env, lookahead, algorithm["iterations"], afterstates, ramp)
 
 
 def _encoded(observation: Observation, planes: Sequence[str]) -> TensorDict:
