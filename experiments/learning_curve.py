@@ -23,12 +23,11 @@ from experiments.rows import main_of
 from marl_pack.files import moved_into_place
 
 MODELS = ROOT / "models"
-OTHERS = ("cut_1_first", "cut_1_second", "cut_1_third", "cut_1_fourth", "cut_1", "cut_2_first",
-          "cut_2_second", "cut_2", "types125")  # fmt: skip
+OTHERS = ("cut_1", "cut_2", "types125", "rs_upright", "types125_upright")
 
-CPUS = {"types125": "AMD EPYC", "plain": "AMD EPYC"}
+CPUS = {"rs": "Intel Xeon with AVX-512"}
 """The CPU of each run that was not trained on ``CPU``."""
-CPU = "Intel Xeon with AVX-512"
+CPU = "AMD EPYC"
 
 
 def history(run: Path) -> Any:

@@ -20,7 +20,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
 from docs.pages import between
 from docs.pages import table as markdown_table
-from experiments import ablations, packing, physics, planning
+from experiments import ablations, learning_curve, packing, physics, planning
 from experiments.rows import main_of, mean
 from marl_pack.files import write_atomically
 from marl_pack.physics import table1
@@ -96,7 +96,7 @@ def render(folder: Path = RESULTS) -> str:
         plans=[(plan, tables["planning"].row(f"{RS}, {plan}"))
                for plan in (planning.NONE, *planning.PLANS)],
         curves=tables["learning_curve"].rows(),
-        order=("rs", "plain", "cut_1", "cut_2", "types125"),
+        order=("rs", "plain", *learning_curve.OTHERS),
         spreads=tables["volume_spread"].rows(),
         greedy=tables["afterstates"].rows(),
         ablations_table=ablations_table(tables["ablations"]),

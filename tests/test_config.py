@@ -112,7 +112,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.teacher=dblf"], r"placement\.teacher_iterations = 0: needs a number from 1"),
     (["--placement.teacher_iterations=-1"], r"teacher_iterations = -1: needs placement"),
     (["--placement.teacher_iterations=5"], r"= 5: needs placement\.teacher"),
-    (["--ppo.afterstate_ramp=[5,2]"], r"afterstate_ramp = \[5, 2\]: needs two iterations in order"),
+    (["--ppo.afterstate_ramp=[5,2]"], r"afterstate_ramp = \[5, 2\]: needs two iterations"),
     (["--placement.teacher_random=1.5"], r"teacher_random = 1.5: needs a number from 0 to 1"),
     (["--orientation.teacher=first", "--orientation.teacher_iterations=5",
       "--orientation.frozen=true", "--orientation.policy=dblf"], r"a frozen agent does not learn"),
