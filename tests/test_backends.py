@@ -164,7 +164,9 @@ def test_hull_masks_equal_the_reference(
 
 
 @every_backend
-@pytest.mark.parametrize(("margin", "offset"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.1), (0.5, 0.1)])
+@pytest.mark.parametrize(
+    ("margin", "offset"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.1), (0.5, 0.1), (1.3, 0.1)]
+)
 def test_hull_masks_of_rough_maps_equal_the_reference(
     backend: Backend, margin: float, offset: float
 ) -> None:

@@ -75,7 +75,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
 
 
 @pytest.mark.parametrize(("options", "expected"), [
-    (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: afterstate_ramp"),
+    (["--ppo.gama=0.9"], r"key 'ppo\.gama'; did you mean 'ppo\.gamma'\? Keys in ppo: after"),
     (["--sed=1"], r"unknown key 'sed'; did you mean 'seed'\? Keys: device, evaluation"),
     (["--ppo.gamma=much"], r"^ppo\.gamma = much: needs a number$"),
     (["--game.rule=hull"], r"game: unknown stability rule 'hull': needs one of hull_1, hull_alpha"),

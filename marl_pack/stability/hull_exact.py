@@ -30,6 +30,12 @@ READ_CELLS = 4
 AT_ONCE = 128
 """Number of neighbouring windows that are solved together."""
 
+BAND = 0.5
+"""Corners at most so many half cells beyond a disc, along x, are left to the exact test."""
+
+TOLERANCE = np.float32(1e-4)
+"""Relative error of sums of rises that float32 never exceeds."""
+
 STEEPEST = 1e6
 """The rise to a corner right above the middle: larger than all other rises."""
 
@@ -324,6 +330,105 @@ def _middles_inside(tops: Any, rows: Any, rises: Any, depth: int, w: int, d: int
                         out[start + i] = OUTSIDE
 
 
+@njit(cache=True)
+def _steepen_over_disc(
+    rows: Any, rises: Any, tops: Any, row: Any, start: Any, n: int, distance: Any, offset: Any,
+    radius: Any, steepest: Any,
+) -> None:  # fmt: skip
+    """Raise the steepest rises of n neighbouring windows by those of tangents to a disc.
+
+    A tangent goes from a corner over the disc around the point. With y the corner's height above
+    the point, it rises by (distance · y - radius · √(distance² + y² - radius²)) / (distance² -
+    radius²) towards the corner.
+
+    Args:
+        distance: float32, along x from the point to the corners, more than ``radius``.
+        offset: float32, how far the window's middle lies above the point, in half cells.
+        radius: float32, of the disc, in half cells: the margin.
+        rows, rises, tops, row, start, n, steepest: as for :func:`_steepen`.
+    """
+    none, rest = np.float32(-np.inf), distance * distance - radius * radius
+    along, over = distance / rest, radius / rest
+    for i in range(np.uint64(n)):
+        y = rises[row + i] + offset
+        rise = along * y - over * np.sqrt(y * y + rest)
+        rise = rise if rows[row + i] == tops[start + i] else none
+        steepest[i] = max(steepest[i], rise)
+
+
+@njit(cache=True)
+def _mark_high(
+    rows: Any, rises: Any, tops: Any, row: Any, start: Any, n: int, offset: Any, low: Any,
+    marks: Any,
+) -> None:  # fmt: skip
+    """Mark each of n neighbouring windows that has contact above ``low`` in a row of its cells.
+
+    Args:
+        offset: float32, how far the window's middle lies above the point, in half cells.
+        low: float32, height above the point, in half cells.
+        marks: uint8 [≥ n], marked.
+        rows, rises, tops, row, start, n: as for :func:`_steepen`.
+    """
+    for i in range(np.uint64(n)):
+        high = rises[row + i] + offset > low
+        marks[i] |= np.uint8(high & (rows[row + i] == tops[start + i]))
+
+
+@njit(cache=True)
+def _discs_inside(
+    tops: Any, rows: Any, rises: Any, depth: int, w: int, point: Any, radius: float, out: Any
+) -> None:
+    """Write for each undecided window whether a disc lies inside the hull of its contact.
+
+    This is :func:`inside` for many windows at a time, as in :func:`_middles_inside`. Seen from the
+    disc's centre, the hull passes above the disc iff the steepest tangents from corners on the left
+    and on the right add up to more than 0; the same holds below. Corners close to the centre along
+    x can only make it pass, if they are above it. Windows that float32 cannot decide are UNSURE.
+
+    Args:
+        tops, rows, rises, depth, w: as for :func:`_middles_inside`.
+        point: the disc's centre: x from the window's low corner, and its distance beyond the
+            window's middle along y, in half cells.
+        radius: of the disc, in half cells.
+        out: uint8 [W · D], written at the undecided positions: OUTSIDE, INSIDE or UNSURE.
+    """
+    steepest = np.empty((2, 2, AT_ONCE), np.float32)  # in each direction, left and right
+    close, band = np.empty((2, AT_ONCE), np.uint8), radius + BAND
+    for start in range(0, tops.size, AT_ONCE):
+        n = min(AT_ONCE, tops.size - start)
+        if not _any_undecided(tops, start, n):
+            continue
+        steepest[:] = np.float32(-np.inf)
+        close[:] = 0
+        for x in range(w):
+            row, first = np.uint64(start + x * depth), np.uint64(start)
+            if not _in_contact(rows, tops, row, first, n):
+                continue
+            for corner in (2 * x - point[0], 2 * x + 2 - point[0]):
+                for side in range(2):
+                    offset = np.float32(point[1] if side else -point[1])
+                    if abs(corner) <= band:
+                        low = np.float32(0 if abs(corner) <= radius else -np.inf)
+                        _mark_high(rows, rises[side], tops, row, first, n, offset, low, close[side])
+                        continue
+                    _steepen_over_disc(
+                        rows, rises[side], tops, row, first, n, np.float32(abs(corner)), offset,
+                        np.float32(radius), steepest[side, int(corner > 0)],
+                    )  # fmt: skip
+        for i in range(n):
+            if tops[start + i] < 0:
+                continue
+            verdict = INSIDE
+            for side in range(2):
+                left, right = steepest[side, 0, i], steepest[side, 1, i]
+                error = TOLERANCE * (1 + abs(left) + abs(right))
+                if left + right < -error and not close[side, i]:
+                    verdict = OUTSIDE
+                elif not left + right > error and verdict == INSIDE:
+                    verdict = UNSURE
+            out[start + i] = verdict
+
+
 @njit(cache=True, inline="always")
 def _level_extremes(
     levels: Any, x: int, y: int, w: int, d: int, top: int, lo: Any, hi: Any
@@ -390,20 +495,22 @@ def solve_middles(
 @njit(cache=True)
 def _solve_together(
     codes: Any, best: Any, levels: Any, depth: int, w: int, d: int, x: float, y: float, unit: float,
-    margin: float, whole: bool, middle: bool, scratch: Any, out: Any,
+    margin: float, whole: bool, scratch: Any, out: Any,
 ) -> int:  # fmt: skip
-    """Do the work of :func:`solve_undecided` without reading the windows one by one.
+    """Do the work of :func:`solve_undecided`, for many windows at a time unless one is near a tie.
 
-    ``levels`` and ``out`` are flat here; ``middle`` says whether the point is the window's middle.
+    ``levels`` and ``out`` are flat here.
     """
     numbers, rises = np.empty((5, levels.size), np.int32), np.empty((2, levels.size), np.float32)
     rows, tops = numbers[3], numbers[4, : codes.size]
     _undecided_levels(codes, best, tops)
     _row_windows(levels, depth, d, numbers[:3], rows, rises)
-    if middle and np.int64(w) * d <= FLOAT32_CELLS:
-        _middles_inside(tops, rows, rises, depth, w, d, out)
-        for position in range(codes.size):  # what lies outside is outside with a margin too
-            tops[position] = tops[position] if out[position] == INSIDE else -1
+    if np.int64(w) * d <= FLOAT32_CELLS:
+        half = 2 / unit
+        point = x * half, y * half - d
+        _discs_inside(tops, rows, rises, depth, w, point, margin * half, out)
+        for position in range(codes.size):
+            tops[position] = tops[position] if out[position] == UNSURE else -1
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
     unsure = 0
     for position in range(codes.size):
@@ -452,7 +559,7 @@ def solve_undecided(
     if _is_much(codes, positions, np.int64(w) * d, width * depth):
         return _solve_together(
             codes[:positions], best, levels.reshape(width * depth), depth, w, d, x, y, unit, margin,
-            whole, middle, scratch, out.reshape(width * depth),
+            whole, scratch, out.reshape(width * depth),
         )  # fmt: skip
     lo, hi = scratch[0, :w, 0], scratch[0, :w, 1]
     unsure = 0
