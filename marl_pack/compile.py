@@ -1,8 +1,8 @@
 """Compile all code now, so that no later start has to wait: ``marl-pack compile``.
 
 Numba compiles a function when it is first called, and stores it in a cache on disk. This command
-calls every compiled function once. Run it when the package is installed, for example in the recipe
-of a container.
+plays a little in every way that commands and environments play. Run it when the package is
+installed, for example in the recipe of a container.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ def _games() -> None:
 
 
 def _policies() -> None:
-    """Let every heuristic play on a small and on a large floor."""
+    """Let every heuristic play on floors of three sizes, which take other code."""
     from marl_pack.agents.heuristics import make_policy
     from marl_pack.agents.keys import POLICIES
     from marl_pack.game.packing import Packing
 
     for name in POLICIES:
-        for side in (10, 20):
+        for side in (10, 14, 20):
             _play(Packing(2, (side, side, side), items="cut1"), make_policy(name, 0))
 
 
@@ -91,10 +91,11 @@ def _environments() -> None:
 
 
 def _stacks() -> None:
-    """Compute a mask from arrays, and judge a stack in static equilibrium."""
+    """Compute masks from arrays, place a box, and judge a stack in static equilibrium."""
     import numpy as np
     import torch
 
+    from marl_pack import bins
     from marl_pack.evaluation.statistics import strict_equilibrium
     from marl_pack.game.packing import Packing
     from marl_pack.stability import RULES, stable_mask
@@ -102,6 +103,7 @@ def _stacks() -> None:
     floor = np.zeros((4, 4), np.int64)
     for rule in RULES:
         stable_mask(rule, floor, floor, (2, 2, 1), 4, np.empty((0, 6), np.int64))
+    bins.place(bins.empty(1, (4, 4, 4), 1), torch.tensor([[2, 2, 1]]), torch.tensor([[0, 0]]))
     game = Packing(1, items=[[2, 3, 4], [3, 3, 3]])
     game.place(torch.tensor([0]), torch.tensor([0]))
     strict_equilibrium(game.plans()[0])
