@@ -100,8 +100,9 @@ def test_the_same_seed_gives_the_same_game(items: str) -> None:
     assert played(3) != played(4)
 
 
-def test_auto_reset_goes_on_with_the_next_episode_of_each_bin() -> None:
-    game, policy = Packing(8, seed=5), make_policy("random", 1)
+@pytest.mark.parametrize("backend", Backend)
+def test_auto_reset_goes_on_with_the_next_episode_of_each_bin(backend: Backend) -> None:
+    game, policy = Packing(8, seed=5, backend=backend), make_policy("random", 1)
     finished = 0
     for _ in range(60):
         outcome = game.place(*policy(game))
@@ -162,9 +163,10 @@ def test_an_illegal_placement_is_refused_and_changes_nothing(auto_reset: bool) -
     assert (game.t == 0).all()
 
 
+@pytest.mark.parametrize("backend", Backend)
 @pytest.mark.parametrize(("orientation", "cell"), [(0, -1), (0, 25), (-1, 0), (6, 0)])
-def test_an_action_out_of_range_is_refused(orientation: int, cell: int) -> None:
-    game = Packing(1, (5, 5, 5), seed=0)
+def test_an_action_out_of_range_is_refused(orientation: int, cell: int, backend: Backend) -> None:
+    game = Packing(1, (5, 5, 5), seed=0, backend=backend)
     with pytest.raises(ValueError, match="may not be placed"):
         game.place(torch.tensor([orientation]), torch.tensor([cell]))
     with pytest.raises(ValueError, match="one whole number for each of 1 games"):
@@ -198,9 +200,11 @@ def test_orientations_that_are_not_allowed_have_no_cell() -> None:
         game.place(*policy(game))
 
 
-def test_weights_and_centres_of_mass_of_placed_boxes_are_stored() -> None:
+@pytest.mark.parametrize("backend", Backend)
+def test_weights_and_centres_of_mass_of_placed_boxes_are_stored(backend: Backend) -> None:
     items = check_items([[2, 4, 6], [3, 3, 3]], (10, 10, 10), weights=[7.0, 1.5])
-    game = Packing(1, items=items, com_offset=(0.25, 0.0, -0.25), auto_reset=False)
+    offset = (0.25, 0.0, -0.25)
+    game = Packing(1, items=items, com_offset=offset, auto_reset=False, backend=backend)
     assert float(game.items.weights) == 7.0
     # Orientation 4 is (d, h, w) along x, y, z: middle (2, 3), shifted by (0, -0.25 · 6).
     game.place(torch.tensor([4]), torch.tensor([10 * 1 + 2]))
@@ -443,11 +447,14 @@ def test_the_papers_tables_heuristics_are_reproduced_on_the_published_sequences(
         assert low < float(outcome.utilization.mean()) < high
 
 
-def test_an_unmasked_orientation_without_a_cell_ends_the_episode_with_nothing_placed() -> None:
+@pytest.mark.parametrize("backend", Backend)
+def test_an_unmasked_orientation_without_a_cell_ends_the_episode_with_nothing_placed(
+    backend: Backend,
+) -> None:
     """A 1 × 1 × 3 bin beside items 1 × 1 × 2 and 1 × 1 × 1: lying, the first fits nowhere."""
     for auto_reset in (False, True):
         game = Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False,
-                       auto_reset=auto_reset)  # fmt: skip
+                       auto_reset=auto_reset, backend=backend)  # fmt: skip
         assert game.orientation_mask.all()
         upright, lying = 0, int((~game.mask[0].flatten(1).any(1)).nonzero()[0])
         outcome = game.place(torch.tensor([upright, lying]), torch.tensor([0, 0]))
@@ -476,28 +483,31 @@ def test_an_episode_goes_on_as_usual_after_one_lost_without_a_cell(backend: Back
     assert outcome.placed.tolist() == [1, 1]
 
 
-def test_a_game_lost_without_a_cell_keeps_its_item_and_shows_no_action() -> None:
-    game = Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False)
+@pytest.mark.parametrize("backend", Backend)
+def test_a_game_lost_without_a_cell_keeps_its_item_and_shows_no_action(backend: Backend) -> None:
+    game, loaded = (
+        Packing(2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False,
+                backend=backend)
+        for _ in range(2)
+    )  # fmt: skip
     lying = int((~game.mask[0].flatten(1).any(1)).nonzero()[0])
     game.place(torch.tensor([0, lying]), torch.tensor([0, 0]))
     assert game.t.tolist() == [1, 0]
     assert game.items.sides.tolist() == [[1, 1, 1], [1, 1, 2]]
     assert game.orientation_mask.any(1).tolist() == [True, False]
-    loaded = Packing(
-        2, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False
-    )
     loaded.load_state_dict(game.state_dict())
     assert loaded.alive.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("wrong", [(-1, 0), (6, 0), (2, -1), (2, 1), (1, 0)])
+@pytest.mark.parametrize("backend", Backend)
 def test_without_a_mask_of_orientations_an_impossible_action_is_refused_too(
-    wrong: tuple[int, int],
+    wrong: tuple[int, int], backend: Backend
 ) -> None:
     """Orientations 0 and 2 to 5 may be chosen, of which 0 alone has a cell."""
     game = Packing(
         1, (1, 1, 3), [[1, 1, 2], [1, 1, 1]], mask_orientations=False, auto_reset=False,
-        orientations=(0, 2, 3, 4, 5),
+        orientations=(0, 2, 3, 4, 5), backend=backend,
     )  # fmt: skip
     with pytest.raises(ValueError, match="choose where the mask is true"):
         game.place(torch.tensor([wrong[0]]), torch.tensor([wrong[1]]))
