@@ -9,8 +9,8 @@ every window around the centre of mass:
 - a contact cell in all four quadrants: the centre of mass is strictly inside their hull;
 - no contact cell in two adjacent quadrants: all contact lies beyond a line through the centre of
   mass, so it is not inside;
-- only the other windows need the exact test on the first and last cells of the window's rows
-  (:mod:`marl_pack.stability.hull_exact`).
+- only the other windows need a test on the first and last cells of the window's rows
+  (:mod:`marl_pack.stability.hull_windows`).
 
 Small maps are processed in runs of windows of the same footprint, so that the loops are long
 enough for the CPU's vector units. Entries that wrap around a row's end are invalid positions and
@@ -27,14 +27,8 @@ from torch import Tensor, from_numpy
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.installation import njit
 from marl_pack.stability.centres import CentreTable
-from marl_pack.stability.hull_exact import (
-    OUTSIDE,
-    UNDECIDED,
-    UNSURE,
-    YES,
-    solve_middles,
-    solve_undecided,
-)
+from marl_pack.stability.hull_exact import OUTSIDE, UNSURE
+from marl_pack.stability.hull_windows import UNDECIDED, YES, solve_middles, solve_undecided
 from marl_pack.stability.mask_runs import earlier_equals, in_bin, runs_of_footprints
 
 RUN_CELLS = 1024
