@@ -99,6 +99,21 @@ def decimals(numbers: NDArray[Any]) -> NDArray[np.float64]:
     return numbers.astype(np.float64)
 
 
+def exact(value: float | Fraction) -> Fraction:
+    """Return a number as a fraction; a float means its shortest decimal, as ``str`` writes it.
+
+    Raises:
+        ValueError: for NaN and infinity.
+    """
+    return value if isinstance(value, Fraction) else _decimal(float(value))
+
+
+@lru_cache(maxsize=1 << 14)  # the same weights and centres occur often
+def _decimal(value: float) -> Fraction:
+    """Return the fraction that the shortest decimal of a float stands for."""
+    return Fraction(str(value))
+
+
 @lru_cache(maxsize=1 << 14)  # the cells of a table repeat
 def number_in(text: str) -> float:
     """Return the number that a text contains in decimal notation; an int if it has only digits.

@@ -11,11 +11,12 @@ from typing import Any, Literal
 
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.networks.shape import Network
-from marl_pack.game.spec import GameSpec, document
+from marl_pack.game.spec import GameSpec
 from marl_pack.items import DEFAULT_SIDES
+from marl_pack.option_record import document
 
 
-@document(" " * 8)
+@document(GameSpec, " " * 8)
 @dataclass(frozen=True)
 class Game(GameSpec):
     """The packing game (docs/environment.md).

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_pack.bins import Bins, utilization
+from marl_pack.checks import exact
 from marl_pack.game.moves import LegalMoves, Moves
 from marl_pack.game.spec import GameSpec
 from marl_pack.game.state import GameState
 from marl_pack.geometry import ORIENTATIONS, Size
 from marl_pack.stability import RULES, reference
-from marl_pack.stability.centres import exact
-from marl_pack.stability.equilibrium_masks import shifts_of
 from marl_pack.stability.exact_equilibrium import Load
 from marl_pack.stability.parameters import check_thresholds
+from marl_pack.stability.reduced_equilibrium import shifts_of
 from marl_pack.stability.static_equilibrium import stands as stack_stands
 
 VARIABLE = "MARL_PACK_CHECK"

@@ -28,11 +28,12 @@ from marl_pack.bins import COUNT, UNKNOWN, Bins, check_device
 from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game import compiled, invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves
-from marl_pack.game.spec import GameOptions, GameSpec, document
+from marl_pack.game.spec import GameOptions, GameSpec
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.geometry import ALL_ORIENTATIONS, orientation_table
 from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
+from marl_pack.option_record import document
 from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
 
@@ -49,7 +50,7 @@ LAST_EPISODE = 2**62
 """The largest number that an episode can have."""
 
 
-@document(" " * 8)
+@document(GameSpec, " " * 8)
 class Packing(Copied):
     """G games, each with one bin and its own conveyor.
 

@@ -7,45 +7,23 @@ the fields of this record. A new option needs one field here, and the code that 
 from __future__ import annotations
 
 import argparse
-import inspect
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from numbers import Integral
-from types import MappingProxyType
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict
 
-from marl_pack import renamed
-from marl_pack.checks import real_number, shown, truth_value
+from marl_pack.checks import shown, truth_value
 from marl_pack.geometry import ALL_ORIENTATIONS, check_size
+from marl_pack.option_record import (
+    OptionRecord,
+    document,
+    finite_number,
+    option,
+    reward_weight,
+)
 from marl_pack.stability import RULES, Rule, make_rule
 from marl_pack.stability.parameters import NO_OFFSET, THRESHOLDS, check_com_offset
 from marl_pack.stability.rules import unknown_rule
-
-T = TypeVar("T")
-NOTHING_TAKEN: Mapping[str, str] = MappingProxyType({})
-
-
-def _option(
-    default: Any,
-    sentence: str,
-    check: Callable[[Any], Any],
-    phrase: Callable[[Any], str],
-    **argument: Any,
-) -> Any:
-    """Return the field of one option.
-
-    Args:
-        default: the default value.
-        sentence: what the option does, with its range.
-        check: a function that returns the value in the right type, or raises ValueError saying what
-            would be right.
-        phrase: a function that describes the value in a few words.
-        **argument: arguments of ``argparse.add_argument`` except the name and the help; ``flag``
-            is the name on the command line if it differs from the option's name.
-    """
-    metadata = {"sentence": sentence, "check": check, "phrase": phrase, "argument": argument}
-    return field(default=default, metadata=metadata)
 
 
 def _rule(value: Any) -> Any:
@@ -58,29 +36,12 @@ MOST_ITEMS = 2**31 - 1
 """Largest number of items that a bin may be limited to."""
 
 
-LARGEST_WEIGHT = 1e9
-"""Largest weight of a part of the reward, so that squares of returns stay within float32."""
-
-
 def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def _number(value: Any) -> float:
-    try:
-        return real_number(value, "")
-    except ValueError:
-        raise ValueError(f"{shown(value)}: needs a finite number") from None
-
-
-def _reward_weight(value: Any) -> float:
-    if abs(_number(value)) > LARGEST_WEIGHT:
-        raise ValueError(f"{shown(value)}: needs a number from -1e9 to 1e9")
-    return float(value)
-
-
 def _margin(value: Any) -> float | None:
-    if value is not None and _number(value) < 0:
+    if value is not None and finite_number(value) < 0:
         raise ValueError(f"{value!r}: needs a number of cells ≥ 0")
     return None if value is None else float(value)
 
@@ -98,7 +59,7 @@ def _com_offset(value: Any) -> tuple[float, float, float]:
     numbers = _listed(value)
     if len(numbers) != 3:
         raise ValueError(f"{shown(value)}: needs three fractions of the item's own sides w, d, h")
-    return check_com_offset(tuple(map(_number, numbers)))
+    return check_com_offset(tuple(map(finite_number, numbers)))
 
 
 def _thresholds(value: Any) -> str | None:
@@ -128,7 +89,7 @@ def _rule_name(rule: Any) -> str:
 
 
 @dataclass(frozen=True)
-class GameSpec:
+class GameSpec(OptionRecord):
     """Every option of a packing game.
 
     The items, the device, the seed and the automatic restart of episodes are not options of a game;
@@ -138,70 +99,61 @@ class GameSpec:
         {options}
     """
 
-    bin: tuple[int, int, int] = _option(
+    bin: tuple[int, int, int] = option(
         (10, 10, 10), "size W, D, H of the bin, in cells.", check_size,
         lambda bin: f"bin {' x '.join(map(str, bin))}",
-        nargs=3, type=int, metavar=("W", "D", "H"),
+        always=True, nargs=3, type=int, metavar=("W", "D", "H"),
     )  # fmt: skip
-    rule: Any = _option(  # noqa: RUF009  # the default is a name
+    rule: Any = option(  # noqa: RUF009  # the default is a name
         "hull_alpha",
         f"stability rule of the masks, one of {', '.join(RULES)} (in Python also a function).",
-        _rule, lambda rule: f"rule {_rule_name(rule)}", choices=list(RULES), metavar="RULE",
+        _rule, lambda rule: f"rule {_rule_name(rule)}", always=True, choices=list(RULES),
+        metavar="RULE",
     )  # fmt: skip
-    margin: float | None = _option(
+    margin: float | None = option(
         None, "cells by which the support polygon is shrunk, 0 or more; null for none.", _margin,
         lambda margin: f"margin {margin:g}", type=float,
     )  # fmt: skip
-    thresholds: str | None = _option(
+    thresholds: str | None = option(
         None,
         f"thresholds of the rule area_ratio, {' or '.join(THRESHOLDS)}; null for its default.",
         _thresholds, lambda thresholds: f"thresholds {thresholds}", choices=list(THRESHOLDS),
         metavar="NAME",
     )  # fmt: skip
-    orientations: tuple[int, ...] = _option(
+    orientations: tuple[int, ...] = option(
         ALL_ORIENTATIONS, "indices of the allowed orientations, from 0 to 5.",
         _orientations, lambda chosen: f"orientations {' '.join(map(str, chosen))}",
         nargs="+", type=int, metavar="O",
     )  # fmt: skip
-    mask_orientations: bool = _option(
+    mask_orientations: bool = option(
         True, "whether orientations without a stable cell are masked; if not, choosing one ends "
         "the episode.", lambda value: truth_value(value, "mask_orientations"),
         lambda masked: "" if masked else "no mask of orientations",
         flag="orientation-mask", action=argparse.BooleanOptionalAction,
     )  # fmt: skip
-    alpha: float = _option(
-        1.0, "weight of the volume gained in the reward (Eq. 5).", _reward_weight,
+    alpha: float = option(
+        1.0, "weight of the volume gained in the reward (Eq. 5).", reward_weight,
         lambda alpha: f"alpha {alpha:g}", type=float,
     )  # fmt: skip
-    beta: float = _option(
-        1.0, "weight of the space wasted in the reward (Eq. 5).", _reward_weight,
+    beta: float = option(
+        1.0, "weight of the space wasted in the reward (Eq. 5).", reward_weight,
         lambda beta: f"beta {beta:g}", type=float,
     )  # fmt: skip
-    com_offset: tuple[float, float, float] = _option(
+    com_offset: tuple[float, float, float] = option(
         NO_OFFSET,
         "offset of the items' centre of mass from their middle, in fractions of w, d, h.",
         _com_offset,
         lambda offset: f"centre of mass off by {' '.join(f'{o:g}' for o in offset)}",
         nargs=3, type=float, metavar=("X", "Y", "Z"),
     )  # fmt: skip
-    max_items: int | None = _option(
+    max_items: int | None = option(
         None, "largest number of items in a bin, 1 or more; the episode ends there; null for no "
         "limit.", _max_items, lambda most: f"at most {most} items", type=int,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check every option.
-
-        Raises:
-            ValueError: naming the option and what would be right.
-        """
-        for option in fields(GameSpec):
-            value = getattr(self, option.name)
-            try:
-                object.__setattr__(self, option.name, option.metadata["check"](value))
-            except (ValueError, TypeError) as error:
-                named = option.name in str(error)
-                raise ValueError(str(error) if named else f"{option.name} = {error}") from None
+        """Check every option, and the rule with its parameters."""
+        super().__post_init__()
         self.make_rule()
 
     def make_rule(self) -> Rule:
@@ -219,53 +171,9 @@ class GameSpec:
         rule: Rule = self.rule
         return rule
 
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> GameSpec:
-        """Return the spec with the options in ``values``; other keys are ignored.
-
-        Args:
-            values: name → value, such as the section ``game`` of a run's settings.
-        """
-        names = {option.name for option in fields(GameSpec)}
-        return GameSpec(**{key: value for key, value in values.items() if key in names})
-
-    def with_options(
-        self, options: Mapping[str, Any], taken: Mapping[str, str] = NOTHING_TAKEN
-    ) -> GameSpec:
-        """Return the spec with some options changed.
-
-        Args:
-            options: name → value.
-            taken: for options with another name in the caller: name → the caller's name.
-
-        Raises:
-            TypeError: for a name that is not an option; the message suggests the nearest option.
-            ValueError: for an impossible value, or an old name.
-        """
-        names = [taken.get(option.name, option.name) for option in fields(GameSpec)]
-        for name in options:
-            renamed.refuse_old(name, renamed.OPTIONS, "option")
-            if name not in names:
-                near = taken.get(name) or renamed.nearest(name, names)
-                guess = renamed.did_you_mean(near)
-                raise TypeError(f"unexpected option {name!r}{guess} Options: {', '.join(names)}")
-        return replace(self, **options) if options else self
-
     def to_dict(self) -> dict[str, Any]:
         """Return name → value of all options; a bound rule is its function's name."""
         return asdict(self) | {"rule": _rule_name(self.rule)}
-
-    def phrases(self) -> list[str]:
-        """Describe the bin, the rule, and every other option that is not at its default."""
-        return [
-            option.metadata["phrase"](getattr(self, option.name))
-            for option in fields(GameSpec)
-            if option.name in ("bin", "rule") or getattr(self, option.name) != option.default
-        ]
-
-    def __str__(self) -> str:
-        """Describe the game, such as ``bin 10 x 10 x 10, rule hull_alpha, margin 1``."""
-        return ", ".join(self.phrases())
 
 
 class GameOptions(TypedDict, total=False):
@@ -282,59 +190,4 @@ class GameOptions(TypedDict, total=False):
     max_items: int | None
 
 
-def document(indent: str) -> Callable[[T], T]:
-    """Return a decorator that lists the options where a docstring says ``{options}``.
-
-    Args:
-        indent: white space before each option's name.
-    """
-    lines = "\n".join(
-        textwrap.fill(
-            f"{option.name}: {option.metadata['sentence']}", 100, initial_indent=indent,
-            subsequent_indent=f"{indent}    ", break_on_hyphens=False,
-        )
-        for option in fields(GameSpec)
-    )  # fmt: skip
-
-    def documented(target: T) -> T:
-        target.__doc__ = (target.__doc__ or "").replace("{options}", lines.strip())
-        return target
-
-    return documented
-
-
-def with_options(signature: inspect.Signature, leave_out: Sequence[str] = ()) -> inspect.Signature:
-    """Return a signature that names every option in place of ``**options``.
-
-    Args:
-        signature: the signature of a function or class with ``**options``.
-        leave_out: options that it takes by another name.
-    """
-    others = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    options = [
-        inspect.Parameter(
-            option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default,
-            annotation=option.type,
-        )
-        for option in fields(GameSpec)
-        if option.name not in leave_out
-    ]  # fmt: skip
-    return signature.replace(parameters=[*others, *options])
-
-
-def add_arguments(parser: argparse._ActionsContainer) -> None:
-    """Add every option to a command by its name, with the default None."""
-    for option in fields(GameSpec):
-        argument = dict(option.metadata["argument"])
-        flag = argument.pop("flag", option.name.replace("_", "-"))
-        sentence = option.metadata["sentence"].rstrip(".")
-        parser.add_argument(f"--{flag}", dest=option.name, help=sentence, **argument)
-
-
-def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options that were given on a command line."""
-    values = {option.name: getattr(arguments, option.name) for option in fields(GameSpec)}
-    return {name: value for name, value in values.items() if value is not None}
-
-
-document(" " * 8)(GameSpec)
+document(GameSpec, " " * 8)(GameSpec)

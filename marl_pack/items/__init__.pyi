@@ -1,11 +1,11 @@
 # __init__.py imports these names at their first use.
 
+from .attributes import ATTRIBUTES as ATTRIBUTES
+from .attributes import Attribute as Attribute
 from .checking import check_items as check_items
 from .cutting import cut as cut
 from .generated import DEFAULT_SIDES as DEFAULT_SIDES
 from .generated import GENERATED as GENERATED
-from .items import ATTRIBUTES as ATTRIBUTES
-from .items import Attribute as Attribute
 from .items import Items as Items
 from .sequences import Sequences as Sequences
 from .sources import choose_stream as choose_stream

@@ -15,14 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.checks import shown
 from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS, Size
-from marl_pack.items.items import (
-    ATTRIBUTES,
-    KEYS,
-    UPRIGHT,
-    Attribute,
-    Items,
-    only_numbers,
-)
+from marl_pack.items.attributes import ATTRIBUTES, KEYS, UPRIGHT, Attribute, only_numbers
+from marl_pack.items.items import Items
 from marl_pack.items.names import check_names
 from marl_pack.items.sequences import Sequences
 

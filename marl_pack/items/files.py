@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.checks import number_in, shown
-from marl_pack.inputs import read_arrays, read_json, read_lines
+from marl_pack.inputs import read_arrays, read_json
+from marl_pack.items.attributes import ATTRIBUTES, KEYS
 from marl_pack.items.checking import Ragged, split_sequences
-from marl_pack.items.items import ATTRIBUTES, KEYS
 from marl_pack.items.names import check_names
+from marl_pack.items.tables import read_sides, read_table, sequence_order
 
 SIDES = ("w", "d", "h")
 COLUMNS = (*SIDES, *(attribute.column for attribute in ATTRIBUTES), "sequence")
@@ -82,8 +82,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 def _read_csv(path: Path) -> dict[str, Any]:
     """Return the fields of a CSV file, which has one item per row, split into sequences."""
-    columns = _read_table(path)
-    sides = np.column_stack([_numbers(path, columns, name) for name in SIDES])
+    columns = read_table(path, COLUMNS, SIDES)
+    sides = read_sides(path, columns, SIDES, "whole cells ≥ 1")
     fields = {"items": sides} | {
         attribute.key: attribute.of_cells(columns[attribute.column])
         for attribute in ATTRIBUTES
@@ -91,9 +91,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
     }
     if "sequence" not in columns:
         return fields | {"lengths": [len(sides)]}
-    ranks: dict[str, int] = {}  # sequences in the order of their first rows
-    rank = np.array([ranks.setdefault(name, len(ranks)) for name in columns["sequence"]])
-    order, counts = rank.argsort(kind="stable"), np.bincount(rank)
+    order, counts = sequence_order(columns["sequence"])
     return {key: Ragged(_reordered(values, order), counts) for key, values in fields.items()}
 
 
@@ -107,47 +105,3 @@ def _reordered(values: list[Any] | NDArray[Any], order: NDArray[np.int64]) -> An
     if isinstance(values, np.ndarray):
         return values[order]
     return [values[i] for i in order.tolist()]
-
-
-def _numbers(path: Path, columns: dict[str, list[str]], name: str) -> NDArray[np.float64]:
-    """Return a column of numbers; refuse the first row whose text is not a number."""
-    numbers: list[float] = []
-    try:
-        for text in columns[name]:
-            numbers.append(number_in(text))
-    except ValueError as error:
-        row = [columns[side][len(numbers)] for side in SIDES]
-        raise ValueError(
-            f"{path}: row {len(numbers)} is {shown(row)}: {name} {error}; needs whole cells ≥ 1"
-        ) from None
-    return np.array(numbers, np.float64)
-
-
-def _read_table(path: Path) -> dict[str, list[str]]:
-    """Read a CSV file; return the texts of each column by the column's name.
-
-    Raises:
-        ValueError: for a column that is missing, unknown or given twice, or a row with too few
-            or too many values; the message names the column or the row.
-    """
-    lines = read_lines(path, trim=True)
-    columns = [name.strip() for name in next(lines, (0, []))[1]]
-    while columns and not columns[-1]:  # spreadsheets write a comma after the last column
-        columns.pop()
-    check_names(columns, COLUMNS, SIDES, str(path), "column")
-    if len(set(columns)) < len(columns):
-        raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
-    # One list for all rows, row by row: a list for each row is three times slower.
-    values: list[str] = []
-    for line, row in lines:
-        if len(row) > len(columns) and not any(row[len(columns) :]):
-            del row[len(columns) :]
-        if len(row) != len(columns) or "" in row:
-            raise ValueError(
-                f"{path}: row {len(values) // len(columns)} (line {line}) is {shown(row)}: needs a "
-                f"value for each of {', '.join(columns)}"
-            )
-        values += row
-    if not values:
-        raise ValueError(f"{path}: has no items")
-    return {name: list(map(str.strip, values[i :: len(columns)])) for i, name in enumerate(columns)}

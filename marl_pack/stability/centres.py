@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from marl_pack.checks import exact
 from marl_pack.geometry.tensor import divide
 
 Offsets = tuple[tuple[float, float], ...]
@@ -27,21 +28,6 @@ HALF = Fraction(1, 2)
 
 LARGEST_WHOLE = 2.0**53
 """Whole numbers up to this limit are exact in float64."""
-
-
-def exact(value: float | Fraction) -> Fraction:
-    """Return a number as a fraction; a float means its shortest decimal, as ``str`` writes it.
-
-    Raises:
-        ValueError: for NaN and infinity.
-    """
-    return value if isinstance(value, Fraction) else _decimal(float(value))
-
-
-@lru_cache(maxsize=1 << 14)  # the same weights and centres occur often
-def _decimal(value: float) -> Fraction:
-    """Return the fraction that the shortest decimal of a float stands for."""
-    return Fraction(str(value))
 
 
 @dataclass(frozen=True)

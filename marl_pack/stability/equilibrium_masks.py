@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from marl_pack.bins import Bins
+from marl_pack.checks import exact
 from marl_pack.installation import njit
-from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import Load
 from marl_pack.stability.oriented_item import OrientedItem
 from marl_pack.stability.reduced_equilibrium import (
@@ -25,16 +25,12 @@ from marl_pack.stability.reduced_equilibrium import (
     YES,
     ground_points,
     mark_bearing,
+    shifts_of,
     stands,
     stands_by_fractions,
     survey,
 )
 from marl_pack.stability.static_equilibrium import in_equilibrium
-
-CORNERS = ((1020, 0), (942, 391), (721, 721), (391, 942))
-"""Corners of a polygon around the disc whose radius is the margin, in thousandths of the margin.
-The other corners are these corners rotated by 90°, 180° and 270°. The polygon reaches at most 2 %
-beyond the disc, so it is never less strict than the disc."""
 
 
 @njit(cache=True, nogil=True)
@@ -132,18 +128,6 @@ def equilibrium_mask(
     for b, a, x, y in np.argwhere(verdict == UNSURE).tolist():
         verdict[b, a, x, y] = _stands_exactly(stack, item, (b, a, x, y), exact_shifts, whole[b])
     return sure | torch.from_numpy(verdict == YES).to(device)
-
-
-def shifts_of(margin: float) -> list[tuple[Fraction, Fraction]]:
-    """Return the shifts (x, y) of a centre of mass with which the stack must stand, in cells."""
-    if margin == 0:
-        return [(Fraction(0), Fraction(0))]
-    scale = exact(margin) / 1000
-    shifts = []
-    for x, y in CORNERS:
-        for corner in ((x, y), (-y, x), (-x, -y), (y, -x)):
-            shifts.append((scale * corner[0], scale * corner[1]))
-    return shifts
 
 
 def _stands_exactly(

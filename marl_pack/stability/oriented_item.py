@@ -7,8 +7,9 @@ from fractions import Fraction
 
 from torch import Tensor
 
+from marl_pack.checks import exact
 from marl_pack.geometry import ORIENTATIONS, oriented
-from marl_pack.stability.centres import HALF, CentreTable, Offsets, centre_table, exact
+from marl_pack.stability.centres import HALF, CentreTable, Offsets, centre_table
 from marl_pack.stability.parameters import NO_OFFSET
 
 

@@ -25,19 +25,25 @@ in whole numbers (:func:`stands_by_fractions`).
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_pack.checks import exact
 from marl_pack.geometry.compiled import place_box
 from marl_pack.installation import njit
-from marl_pack.stability.centres import exact
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 from marl_pack.stability.hull_exact import envelope, row_extremes
 from marl_pack.stability.simplex import NEAR, max_least_force, nearly_a_tie
 
 NO, YES, UNSURE = 0, 1, 2
+
+CORNERS = ((1020, 0), (942, 391), (721, 721), (391, 942))
+"""Corners of a polygon around the disc whose radius is the margin, in thousandths of the margin.
+The other corners are these corners rotated by 90°, 180° and 270°. The polygon reaches at most 2 %
+beyond the disc, so it is never less strict than the disc."""
 
 
 @njit(cache=True, inline="always")
@@ -55,9 +61,9 @@ def _overlap(a: Any, b: Any) -> tuple[int, int, int, int]:
 
 
 @njit(cache=True, inline="always")
-def _touches(a: Any, b: Any) -> bool:
-    """Return whether box ``a`` rests on box ``b``."""
-    if a[2] != b[2] + b[5]:
+def _touches(a: Any, b: Any, tolerance: int) -> bool:
+    """Return whether box ``a`` rests on box ``b``, or ends at most ``tolerance`` above it."""
+    if not 0 <= a[2] - b[2] - b[5] <= tolerance:
         return False
     x0, y0, x1, y1 = _overlap(a, b)
     return x0 < x1 and y0 < y1
@@ -136,7 +142,7 @@ def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[An
         whole = mark_bearing(heightmap, empty_map, x, y, z, cells)
         place_box(heightmap, empty_map, x, y, w, d, h)
         for j in range(k):
-            if whole and not grounded[j] and _touches(boxes[k], boxes[j]):
+            if whole and not grounded[j] and _touches(boxes[k], boxes[j], 0):
                 whole = False
         grounded[k] = whole
         if not whole:
@@ -145,7 +151,9 @@ def survey(boxes: Any, n: int, shape: tuple[int, int], scratch: Any) -> tuple[An
 
 
 @njit(cache=True, inline="always")
-def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tuple[Any, Any, int]:
+def _component(
+    boxes: Any, n: int, grounded: Any, count: Any, whole: bool, tolerance: int
+) -> tuple[Any, Any, int]:
     """Find the boxes that the new box ``n`` may disturb.
 
     Returns:
@@ -170,10 +178,10 @@ def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tu
         for j in range(n + 1):
             if j == i or grounded[j]:
                 continue
-            below = _touches(boxes[i], boxes[j])
+            below = _touches(boxes[i], boxes[j], tolerance)
             if below:
                 forces += 4
-            if row[j] < 0 and (below or _touches(boxes[j], boxes[i])):
+            if row[j] < 0 and (below or _touches(boxes[j], boxes[i], tolerance)):
                 queue[size], row[j] = j, size
                 size += 1
     return queue[:size], row, forces
@@ -182,7 +190,7 @@ def _component(boxes: Any, n: int, grounded: Any, count: Any, whole: bool) -> tu
 @njit(cache=True, inline="always")
 def _system(
     boxes: Any, loads: Any, grounded: Any, points: Any, count: Any, members: Any, row: Any,
-    forces: int,
+    forces: int, tolerance: int,
 ) -> tuple[Any, Any]:  # fmt: skip
     """Build the equations ``a f = weight`` that balance forces and moments of the members.
 
@@ -205,7 +213,7 @@ def _system(
             a[3 * k + 2, c] = (boxes[i, 1] + points[i, p, 1] - loads[i, 2]) / reach
             c += 1
         for j in range(n):
-            if j == i or grounded[j] or not _touches(boxes[i], boxes[j]):
+            if j == i or grounded[j] or not _touches(boxes[i], boxes[j], tolerance):
                 continue
             m = row[j]
             other = float(max(boxes[j, 3], boxes[j, 4]))
@@ -223,8 +231,9 @@ def _system(
 
 @njit(cache=True)
 def stands(
-    boxes: Any, loads: Any, n: int, grounded: Any, points: Any, count: Any, whole: bool
-) -> int:
+    boxes: Any, loads: Any, n: int, grounded: Any, points: Any, count: Any, whole: bool,
+    tolerance: int = 0,
+) -> int:  # fmt: skip
     """Decide whether box ``n`` and the boxes placed before it are in strict equilibrium.
 
     Args:
@@ -235,12 +244,15 @@ def stands(
         points: float64 [n + 1, V, 2], ground points of each box.
         count: int64 [n + 1], number of ground points of each box.
         whole: whether to solve all ungrounded boxes, or only those that the new box may disturb.
+        tolerance: how far a supporting top may lie below a box.
 
     Returns:
         YES or NO; UNSURE if rounding errors could change the result.
     """
-    members, row, forces = _component(boxes, n, grounded, count, whole)
-    a, weight = _system(boxes, loads, grounded, points, count, members, row, forces)
+    members, row, forces = _component(boxes, n, grounded, count, whole, tolerance)
+    a, weight = _system(
+        boxes, loads, grounded, points, count, members, row, forces, tolerance
+    )  # fmt: skip
     force, reliable, _ = max_least_force(a, weight, 10 * NEAR)
     reach = 0
     for i in members:
@@ -275,13 +287,35 @@ def stands_by_fractions(
         grounded[n], count[n] = False, 4
         w, d = boxes[n, 3:5]
         points[n, :4] = (0, 0), (0, d), (w, 0), (w, d)
-    members, row, _ = _component(boxes, n, grounded[: n + 1], count[: n + 1], whole)
+    return solve_exactly(boxes, loads, new, grounded[: n + 1], points, count[: n + 1], whole)
+
+
+def solve_exactly(
+    boxes: NDArray[np.int64],
+    loads: NDArray[np.float64],
+    new: Load,
+    grounded: NDArray[np.bool_],
+    points: NDArray[np.float64],
+    count: NDArray[np.int64],
+    whole: bool,
+    tolerance: int = 0,
+) -> bool:
+    """Decide in exact arithmetic what :func:`stands` decides in float64; see its arguments.
+
+    Args:
+        boxes: int64 [n + 1, 6]; the last box is new.
+        loads: float64 [n, 3], loads of the other boxes; decimals are taken exactly.
+        new: the load of the new box.
+        grounded, points, count, whole, tolerance: as for :func:`stands`.
+    """
+    n = len(boxes) - 1
+    members, row, _ = _component(boxes, n, grounded, count, whole, tolerance)
     forces = []
     for i in members.tolist():
         for x, y in (boxes[i, :2] + points[i, : count[i]]).astype(np.int64).tolist():
             forces.append(Force(x, y, int(row[i]), GROUND))
-        for j in np.flatnonzero(~grounded[: n + 1]).tolist():
-            if j != i and _touches(boxes[i], boxes[j]):
+        for j in np.flatnonzero(~grounded).tolist():
+            if j != i and _touches(boxes[i], boxes[j], tolerance):
                 x0, y0, x1, y1 = map(int, _overlap(boxes[i], boxes[j]))
                 for x, y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
                     forces.append(Force(x, y, int(row[i]), int(row[j])))
@@ -289,3 +323,15 @@ def stands_by_fractions(
         new if i == n else Load(*map(exact, loads[i].tolist())) for i in members.tolist()
     ]
     return stands_exactly(exact_loads, forces)
+
+
+def shifts_of(margin: float | Fraction) -> list[tuple[Fraction, Fraction]]:
+    """Return the shifts (x, y) of a centre of mass with which the stack must stand, in cells."""
+    if margin == 0:
+        return [(Fraction(0), Fraction(0))]
+    scale = exact(margin) / 1000
+    shifts = []
+    for x, y in CORNERS:
+        for corner in ((x, y), (-y, x), (-x, -y), (y, -x)):
+            shifts.append((scale * corner[0], scale * corner[1]))
+    return shifts

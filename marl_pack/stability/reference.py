@@ -16,7 +16,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.stability.centres import exact
+from marl_pack.checks import exact
 
 Number = int | float | Fraction
 Point = tuple[Number, Number]

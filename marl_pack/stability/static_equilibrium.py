@@ -23,8 +23,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from marl_pack.checks import decimals, shown
-from marl_pack.stability.centres import exact
+from marl_pack.checks import decimals, exact, shown
 from marl_pack.stability.exact_equilibrium import GROUND, Force, Load, stands_exactly
 
 NEAR = 1e-5

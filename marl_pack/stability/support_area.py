@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from marl_pack.checks import exact
 from marl_pack.geometry.compiled import mark_valid, slide
 from marl_pack.geometry.tensor import bins_last, shift, slide_counts
 from marl_pack.installation import njit
-from marl_pack.stability.centres import exact
 from marl_pack.stability.parameters import Thresholds
 
 
