@@ -1,0 +1,193 @@
+"""Goods: the boxes to be packed, in whole units, with what may be done to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_pack.checks import number_in, real_number, shown
+from marl_pack.exact.lengths import to_units
+from marl_pack.exact.spec import ExactSpec
+from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS
+from marl_pack.items.attributes import ATTRIBUTES, TRUTH, UPRIGHT, Attribute
+from marl_pack.items.names import check_names
+
+MOST_ROWS = 10_000_000
+"""The largest number of boxes that goods may have, quantities counted."""
+
+AXES = np.array(ORIENTATIONS)
+
+
+def _max_load(value: Any) -> float:
+    return real_number(value, "max_load")
+
+
+GOODS_ATTRIBUTES: tuple[Attribute, ...] = (
+    *(replace(a, column="weight_kg") if a.key == "weights" else a for a in ATTRIBUTES),
+    Attribute(
+        "stackable", "stackable", "true or false (1 or 0, yes or no)", (), np.bool_, "b", str,
+        lambda value: TRUTH[value.lower() if isinstance(value, str) else value],
+        lambda values: np.ones(len(values), bool),
+    ),
+    Attribute(
+        "max_load_kg", "max_load", "a number ≥ 0", (), np.float64, "iuf", number_in, _max_load,
+        lambda values: np.array(np.isfinite(values) & (values >= 0), bool),
+    ),
+)  # fmt: skip
+"""The attributes that users may give with goods."""
+KEYS = tuple(attribute.key for attribute in GOODS_ATTRIBUTES)
+
+
+@dataclass(frozen=True)
+class Goods:
+    """Boxes with their attributes, one row for each box."""
+
+    sides: NDArray[np.int64]  # [R, 3]            own sides w, d, h in units
+    weights: NDArray[np.float64]  # [R]           kilograms; NaN: unknown
+    orientations: NDArray[np.bool_]  # [R, 6]     orientations it may be placed in
+    stackable: NDArray[np.bool_]  # [R]           whether anything may rest on it
+    max_load: NDArray[np.float64]  # [R]          largest weight above it, kilograms
+    ids: NDArray[np.object_]  # [R]               its id, a text; "" where there is none
+
+    def __len__(self) -> int:
+        return len(self.sides)
+
+    def __getitem__(self, index: Any) -> Self:
+        """Return the chosen rows."""
+        return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @property
+    def volumes(self) -> NDArray[np.float64]:
+        """Volume of each box in cubic units, float64 [R]."""
+        return self.sides.astype(np.float64).prod(-1)
+
+
+def check_goods(
+    sides_mm: ArrayLike, spec: ExactSpec, *, source: str = "items", **attributes: Any
+) -> Goods:
+    """Check goods and return them in units; a row with a quantity is repeated.
+
+    Args:
+        sides_mm: numbers [R, 3], own sides w, d, h in millimetres.
+        spec: the game: goods need to fit into its bin and its unit.
+        source: name of the goods in messages.
+        attributes: values of :data:`GOODS_ATTRIBUTES` by key, one for each row: ``weights``
+            (kilograms), ``upright``, ``orientations``, ``ids``, ``quantity``, ``stackable``,
+            ``max_load`` (kilograms).
+
+    Raises:
+        ValueError: naming the row, and what would be right.
+    """
+    check_names(attributes, KEYS, (), source, "attribute")
+    try:
+        rows = np.asarray(sides_mm)
+    except ValueError:  # rows of different lengths
+        rows = np.empty(0, object)
+    if rows.dtype.kind not in "iuf" or rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):
+        raise ValueError(f"{source}: needs rows of three numbers, w d h in mm")
+    values = {
+        attribute.key: _column(attribute, attributes[attribute.key], rows, source)
+        for attribute in GOODS_ATTRIBUTES
+        if attributes.get(attribute.key) is not None
+    }
+    units, inexact = to_units(rows, spec.unit_mm)
+    _refuse(~np.isfinite(rows).all(1), rows, source, "needs finite numbers")
+    _refuse((rows <= 0).any(1), rows, source, "zero or negative; needs sides > 0 mm")
+    _refuse(
+        inexact.any(1), rows, source,
+        f"needs whole units of {spec.unit_mm:g} mm; choose a smaller unit (unit_mm)",
+    )  # fmt: skip
+    allowed = _allowed(values.get("orientations"), values.get("upright"), rows, source)
+    allowed &= np.isin(ALL_ORIENTATIONS, spec.orientations)
+    _refuse(~allowed.any(1), rows, source, f"may not take an orientation of {spec.orientations}")
+    placed = units[:, AXES]  # [R, 6, 3]
+    fits = allowed & (placed <= _room(spec)).all(2)
+    _refuse(
+        ~fits.any(1), rows, source,
+        f"fits into the bin of {' x '.join(f'{side:g}' for side in spec.bin_mm)} mm in none of its "
+        "orientations",
+    )  # fmt: skip
+    thin = (fits & (placed[:, :, 2] <= spec.limits().tolerance)).any(1)
+    _refuse(
+        thin & (spec.level_tolerance_mm > 0), rows, source,
+        f"lower than level_tolerance_mm = {spec.level_tolerance_mm:g}; needs a smaller tolerance",
+    )  # fmt: skip
+    count = len(rows)
+    goods = Goods(
+        sides=units,
+        weights=values.get("weights", np.full(count, np.nan)),
+        orientations=allowed,
+        stackable=values.get("stackable", np.ones(count, np.bool_)),
+        max_load=values.get("max_load", np.full(count, np.inf)),
+        ids=np.array([str(name) for name in values.get("ids", [""] * count)], object),
+    )
+    quantity = values.get("quantity")
+    if quantity is None:
+        return goods
+    if quantity.sum(dtype=np.float64) > MOST_ROWS:
+        raise ValueError(f"{source}: {quantity.sum()} boxes: needs at most {MOST_ROWS}")
+    return goods[np.arange(count).repeat(quantity)]
+
+
+def _room(spec: ExactSpec) -> NDArray[np.int64]:
+    """Return the longest sides of a box that fits into the bin, int64 [3]."""
+    gap = 2 * spec.limits().clearance
+    return np.array(spec.size, np.int64) - np.array((gap, gap, 0), np.int64)
+
+
+def _column(
+    attribute: Attribute, values: Any, rows: NDArray[Any], source: str
+) -> NDArray[Any]:  # fmt: skip
+    """Return the checked values of one attribute, [R, *shape]."""
+    if not isinstance(values, np.ndarray):
+        values = (
+            list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
+        )
+    if len(values) != len(rows):
+        raise ValueError(
+            f"{source}: {attribute.key!r} needs one value for each of {len(rows)} rows"
+        )
+    array, wrong = attribute.read(values)
+    text = shown(values[int(wrong.argmax())])
+    _refuse(wrong, rows, source, f"{attribute.column} {text}; needs {attribute.needs}")
+    return array
+
+
+def _allowed(
+    orientations: NDArray[np.bool_] | None,
+    upright: NDArray[np.bool_] | None,
+    rows: NDArray[Any],
+    source: str,
+) -> NDArray[np.bool_]:
+    """Return the orientations that both attributes allow for each row, bool [R, 6]."""
+    stays_upright = np.isin(ALL_ORIENTATIONS, UPRIGHT)
+    allowed = np.ones((len(rows), len(ALL_ORIENTATIONS)), np.bool_)
+    if orientations is not None:
+        allowed = orientations.copy()
+    if upright is not None:
+        if orientations is not None:
+            tips = upright & (orientations & ~stays_upright).any(1)
+            _refuse(tips, rows, source, "upright, so its orientations may only be 0 and 1")
+        allowed[upright] &= stays_upright
+    return allowed
+
+
+def _refuse(wrong: Any, rows: NDArray[Any], source: str, why: str) -> None:
+    """Raise ValueError about the first row where ``wrong`` [R] is true, if there is one."""
+    for i in np.flatnonzero(wrong)[:1].tolist():
+        raise ValueError(f"{source}: row {i} is {shown(rows[i].tolist())}: {why}")
+
+
+def goods_of(items: Any, spec: ExactSpec, source: str = "items") -> Goods:
+    """Return goods from rows of sides in millimetres, a mapping with attributes, or goods."""
+    if isinstance(items, Goods):
+        return items
+    if isinstance(items, Mapping):
+        check_names(items, ("items", *KEYS), ("items",), source, "key")
+        rest = {key: value for key, value in items.items() if key != "items"}
+        return check_goods(items["items"], spec, source=source, **rest)
+    return check_goods(items, spec, source=source)
