@@ -20,14 +20,28 @@ import numpy as np
 import torch
 from pettingzoo.utils.wrappers import BaseWrapper
 
-from marl_pack import env_aec
+from marl_pack import env_aec, env_turns
 from marl_pack.env_aec import AGENTS
+from marl_pack.env_mm import COLUMNS
 from marl_pack.evaluation.statistics import interval
 from marl_pack.files import write_json
-from marl_pack.integrations.network import ActorCritic
+from marl_pack.integrations.network import ActorCritic, MovesActorCritic
 
 HELD_OUT = 10**9
 """Seed of the sequences played before and after training. Training uses smaller seeds."""
+
+
+CARTONS = {
+    "items": [[600, 400, 300], [600, 400, 200], [400, 300, 250], [400, 300, 150], [300, 200, 200],
+              [300, 200, 120], [395, 295, 285], [585, 385, 245], [350, 250, 220], [500, 310, 180]],
+    "quantity": [2, 2, 4, 4, 4, 3, 3, 2, 3, 2],
+}  # fmt: skip
+"""Made-up cartons in millimetres, drawn in proportion to their quantities."""
+MILLIMETRES: dict[str, Any] = {
+    "world": "mm", "items": CARTONS, "order": "draw", "length": 60, "bin_mm": (1200, 800, 1000),
+    "orientations": (0, 1), "rule": "lbcp", "margin_mm": 20, "max_moves": 128,
+}  # fmt: skip
+"""The options of the environment with ``--world mm``."""
 
 
 class Counted(BaseWrapper):
@@ -70,15 +84,21 @@ class Session:
     Attributes:
         items: approximate number of items to train on.
         turns: approximate number of turns of both agents between two updates.
-        bin_size: W, D, H in cells.
+        bin_size: W, D, H in cells; with ``--world mm`` in millimetres.
         seed: seed of weights and items.
 
     Args:
         arguments: arguments of the command line; None: the arguments of this process.
         description: the text of ``--help``.
+        worlds: the worlds that the example can play.
     """
 
-    def __init__(self, arguments: Sequence[str] | None = None, description: str = "") -> None:
+    def __init__(
+        self,
+        arguments: Sequence[str] | None = None,
+        description: str = "",
+        worlds: Sequence[str] = ("cells",),
+    ) -> None:
         parser = argparse.ArgumentParser(description=description)
         add = parser.add_argument
         add("--items", type=int, default=100_000,
@@ -95,10 +115,17 @@ class Session:
             help="held-out sequences played before and after training (default: 100)")  # fmt: skip
         add("--seed", type=int, default=0, help="seed of weights and items (default: 0)")
         add("--json", type=Path, metavar="FILE", help="write the compliance report to this file")
+        if len(worlds) > 1:
+            add("--world", choices=worlds, default=worlds[0],
+                help="mm: cartons in millimetres instead of whole cells")  # fmt: skip
         options = parser.parse_args(arguments)
+        self.in_mm = len(worlds) > 1 and options.world == "mm"
         self.items, self.turns, self.seed = options.items, options.turns, options.seed
         self.episodes = options.episodes
-        self.bin_size, self.sides = tuple(options.bin), tuple(options.sides)
+        self.game = {"bin_size": tuple(options.bin), "sides": tuple(options.sides)}
+        self.bin_size = tuple(options.bin)
+        if self.in_mm:
+            self.game, self.bin_size = MILLIMETRES, MILLIMETRES["bin_mm"]
         self.json: Path | None = options.json
         if self.episodes < 2:
             parser.error("--episodes: needs at least 2 for an interval")
@@ -111,13 +138,13 @@ class Session:
 
     def env(self, **options: Any) -> Counted:
         """Return a new AEC environment (:func:`marl_pack.env_aec.env`) with counters."""
-        env = Counted(env_aec.env(bin_size=self.bin_size, sides=self.sides, **options))
+        env = Counted(env_aec.env(**self.game, **options))
         self.envs.append(env)
         return env
 
-    def parallel_env(self, **options: Any) -> env_aec.Turns:
+    def parallel_env(self, **options: Any) -> env_turns.Turns:
         """Return a new environment in the parallel API, turn by turn, with counters."""
-        return env_aec.Turns(self.env(**options))
+        return env_turns.Turns(self.env(**options))
 
     def go_on(self) -> bool:
         """Return whether items and minutes are left for training."""
@@ -133,7 +160,16 @@ class Session:
         """Items placed in all environments."""
         return sum(env.items for env in self.envs)
 
-    def watch(self, orientation: ActorCritic, placement: ActorCritic) -> None:
+    def network(self, agent: str) -> ActorCritic | MovesActorCritic:
+        """Return a new network for an agent that reads the observations of the game."""
+        kind = agent.partition("_")[0]
+        return MovesActorCritic(kind, len(COLUMNS)) if self.in_mm else ActorCritic(kind)
+
+    def watch(
+        self,
+        orientation: ActorCritic | MovesActorCritic,
+        placement: ActorCritic | MovesActorCritic,
+    ) -> None:
         """Remember the networks that will learn, play with them, and start to time the training.
 
         The report checks later that the weights of these networks have changed.
@@ -166,7 +202,7 @@ class Session:
         Each agent takes its most probable action. The interval is by Student's t.
         """
         both = self.networks[AGENTS[0]].agent == "both"
-        env = env_aec.env(bin_size=self.bin_size, sides=self.sides, pad_actions=both)
+        env = env_aec.env(**self.game, **({"pad_actions": True} if both else {}))
         utilizations = []
         for episode in range(self.episodes):
             env.reset(seed=HELD_OUT if episode == 0 else None)
@@ -228,6 +264,7 @@ def run(
     train: Callable[[Session], None],
     arguments: Sequence[str] | None = None,
     description: str = "",
+    worlds: Sequence[str] = ("cells",),
 ) -> int:
     """Run an example and print its compliance report.
 
@@ -237,11 +274,12 @@ def run(
         train: the function that trains both agents until the session ends.
         arguments: arguments of the command line; None: the arguments of this process.
         description: the text of ``--help``.
+        worlds: the worlds that the example can play.
 
     Returns:
         The exit status: 0 if it :func:`passes`.
     """
-    session = Session(arguments, description)
+    session = Session(arguments, description, worlds)
     _running.append(session)
     train(session)
     report = session.report(trainer, package)

@@ -149,35 +149,41 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv
-from pettingzoo.utils import wrappers
-from pettingzoo.utils.conversions import (
-    aec_to_parallel_wrapper,
-    turn_based_aec_to_parallel_wrapper,
-)
 
 from marl_pack.bins import COUNT, FILLED, HEIGHTMAP
-from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
+from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
+from marl_pack.env_turns import AGENTS as AGENTS
+from marl_pack.env_turns import (
+    ORIENTATION,
+    PLACEMENT,
+    TurnEnv,
+    in_parallel,
+    one_of,
+    wrap,
+)
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameOptions, GameSpec, document, with_options
-from marl_pack.game.state import Copied
+from marl_pack.game.spec import GameOptions, GameSpec
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.installation import njit
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
+from marl_pack.option_record import document, with_options
 from marl_pack.plan import Plan
 
-ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
-AGENTS = [ORIENTATION, PLACEMENT]
+if TYPE_CHECKING:
+    from marl_pack.env_mm import OptionsMm
+
 TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
 RENDER_MODES = ["human", "rgb_array", "ansi"]
+WORLDS = ("cells", "mm")
 
 
 class Options(GameOptions, total=False):
@@ -193,24 +199,59 @@ class Options(GameOptions, total=False):
     illegal: str
 
 
-def env(*, illegal_reward: float = -1.0, **options: Unpack[Options]) -> AECEnv:
+@overload
+def env(
+    *, world: Literal["cells"] = ..., illegal_reward: float = ..., **options: Unpack[Options]
+) -> AECEnv: ...
+@overload
+def env(
+    *, world: Literal["mm"], illegal_reward: float = ..., **options: Unpack[OptionsMm]
+) -> AECEnv: ...
+def env(*, world: str = "cells", illegal_reward: float = -1.0, **options: Any) -> AECEnv:
     """Return the environment in PettingZoo's usual wrappers.
 
     Args:
+        world: ``"cells"``, or ``"mm"`` for boxes in millimetres: :mod:`marl_pack.env_mm` describes
+            it and its other options.
         illegal_reward: reward of the agent that ends the game by an illegal action (only with
             ``illegal="terminate"``).
         **options: the arguments of :class:`raw_env`: ``bin_size``, ``items``, ``rule``, …
     """
-    illegal_reward = real_number(illegal_reward, "illegal_reward")
-    environment: AECEnv = raw_env(**options)
-    if environment.unwrapped.illegal == "terminate":
-        environment = wrappers.TerminateIllegalWrapper(environment, illegal_reward=illegal_reward)
-    environment = wrappers.AssertOutOfBoundsWrapper(environment)
-    return OrderEnforcing(environment)
+    return _make(world, illegal_reward, options)
 
 
+def _make(world: str, illegal_reward: float, options: Mapping[str, Any]) -> AECEnv:
+    """Return the environment of a world in PettingZoo's usual wrappers."""
+    one_of("world", world, WORLDS)
+    if world == "mm":
+        from marl_pack import env_mm
+
+        return wrap(env_mm.raw_env(**options), illegal_reward)
+    return wrap(raw_env(**options), illegal_reward)
+
+
+@overload
 def parallel_env(
-    *, simultaneous: bool = False, illegal_reward: float = -1.0, **options: Unpack[Options]
+    *,
+    world: Literal["cells"] = ...,
+    simultaneous: bool = ...,
+    illegal_reward: float = ...,
+    **options: Unpack[Options],
+) -> Any: ...
+@overload
+def parallel_env(
+    *,
+    world: Literal["mm"],
+    simultaneous: bool = ...,
+    illegal_reward: float = ...,
+    **options: Unpack[OptionsMm],
+) -> Any: ...
+def parallel_env(
+    *,
+    world: str = "cells",
+    simultaneous: bool = False,
+    illegal_reward: float = -1.0,
+    **options: Any,
 ) -> Any:
     """Return the environment in PettingZoo's parallel API.
 
@@ -224,6 +265,7 @@ def parallel_env(
     every step. It needs ``illegal="repair"``.
 
     Args:
+        world: the argument of :func:`env`.
         simultaneous: whether one step is one item (see above).
         illegal_reward: the argument of :func:`env`.
         **options: the arguments of :class:`raw_env`.
@@ -231,115 +273,12 @@ def parallel_env(
     Raises:
         ValueError: if ``simultaneous`` is true without ``illegal="repair"``.
     """
-    if truth_value(simultaneous, "simultaneous") and options.get("illegal") != "repair":
-        raise ValueError("simultaneous = True needs illegal = 'repair': no mask can be exact there")
-    return (AtOnce if simultaneous else Turns)(env(illegal_reward=illegal_reward, **options))
+    environment = _make(world, illegal_reward, options)
+    return in_parallel(environment, simultaneous)
 
 
-def _of_the_turn(name: str) -> property:
-    """Return a property that reads an attribute of the unwrapped environment.
-
-    Before the first ``reset`` it raises PettingZoo's AttributeError.
-    """
-
-    def read(self: OrderEnforcing) -> Any:
-        if not self._has_reset:
-            raise AttributeError(f"{name} cannot be accessed before reset")
-        return getattr(self._raw, name)
-
-    return property(read)
-
-
-class OrderEnforcing(Copied, wrappers.OrderEnforcingWrapper):
-    """PettingZoo's outermost wrapper: it refuses calls in a wrong order, and wrong actions.
-
-    A legal action goes straight to the environment, since the wrappers in between would only check
-    it again.
-    """
-
-    _has_reset: bool
-    _has_updated: bool
-
-    agents = _of_the_turn("agents")
-    agent_selection = _of_the_turn("agent_selection")
-    rewards = _of_the_turn("rewards")
-    terminations = _of_the_turn("terminations")
-    truncations = _of_the_turn("truncations")
-    infos = _of_the_turn("infos")
-
-    def __init__(self, env: AECEnv) -> None:
-        super().__init__(env)
-        self._raw: raw_env = env.unwrapped  # the wrappers' own look-ups take microseconds
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begin an episode; if the arguments are refused, nothing changes."""
-        before = self._has_reset, self._has_updated
-        try:
-            super().reset(seed=seed, options=options)
-        except ValueError:
-            self._has_reset, self._has_updated = before
-            raise
-
-    def step(self, action: int | None) -> None:
-        """Play the selected agent's action; None once that agent has ended.
-
-        Raises:
-            ValueError: for an action that is not a whole number in its action space.
-        """
-        raw = self._raw
-        if self._has_reset and raw.agents:
-            agent = raw.agent_selection
-            if action is not None or not (raw.terminations[agent] or raw.truncations[agent]):
-                action = raw.check_action(agent, action)
-                if raw.can_play(action):
-                    self._has_updated = True
-                    raw.step(action)
-                    return
-                self.env.observe(agent)  # the wrapper for illegal actions compares with the mask
-        super().step(action)
-
-    def observe(self, agent: str) -> Any:
-        """Return the agent's observation."""
-        return self._raw.observe(agent) if self._has_reset else super().observe(agent)
-
-    def last(self, observe: bool = True) -> Any:
-        """Return the same as PettingZoo's ``last``; raise ValueError once no agent is left."""
-        return self._raw.last(observe) if self._has_reset else super().last(observe)
-
-    def __str__(self) -> str:
-        return str(self.env)
-
-
-class AtOnce(Copied, aec_to_parallel_wrapper):
-    """PettingZoo's parallel view with one item in each step; a refused step changes nothing."""
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        """Play one action of each agent."""
-        _check_actions(self.unwrapped, self.unwrapped.agents, actions)
-        return super().step(actions)
-
-
-class Turns(Copied, turn_based_aec_to_parallel_wrapper):
-    """PettingZoo's parallel view with one turn in each step; every info says whose turn it is."""
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode; name the acting agent in every info."""
-        return self._name_active(*super().reset(seed=seed, options=options))
-
-    def step(self, actions: dict[str, Any]) -> Any:
-        """Play the acting agent's action; name the next one in every info."""
-        raw = self.unwrapped
-        _check_actions(raw, [raw.agent_selection] if raw.agents else [], actions)
-        return self._name_active(*super().step(actions))
-
-    def _name_active(self, *returned: Any) -> Any:
-        for info in returned[-1].values():
-            info["active_agent"] = self.aec_env.agent_selection
-        return returned
-
-
-@document(" " * 8)
-class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
+@document(GameSpec, " " * 8)
+class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
     """The environment without wrappers: one bin and two agents.
 
     The module's docstring describes agents, spaces, masks, reward and the end of an episode. Copies
@@ -391,16 +330,11 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         illegal: str = "terminate",
         **options: Unpack[GameOptions],
     ) -> None:
-        super().__init__()
-        _one_of("mask_in", mask_in, ("observation", "info"))
-        _one_of("illegal", illegal, ("terminate", "repair"))
+        super().__init__(max_cycles, mask_in, illegal)
         if render_mode is not None:
-            _one_of("render_mode", render_mode, RENDER_MODES)
-        if max_cycles is not None:
-            max_cycles = whole_number(max_cycles, "max_cycles (None for no limit)", 1)
-        self.render_mode, self.max_cycles = render_mode, max_cycles
+            one_of("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = render_mode
         self.pad_actions = truth_value(pad_actions, "pad_actions")
-        self.mask_in, self.illegal = mask_in, illegal
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
         self._game = self._stream_game
@@ -408,7 +342,6 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._unit = max(self._game.size)
         self._episode = -1  # number of the stream's last episode that was begun
         self._seed: int | None = None  # seed of the stream; None before the first episode
-        self._chosen: int | None = None
         self._read_game()
 
         width, depth, _ = self._game.size
@@ -417,8 +350,6 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             choices = dict.fromkeys(AGENTS, max(choices.values()))
         self._choices = choices
         planes = spaces.Box(0.0, 1.0, (5 if pad_actions else 4, width, depth), np.float32)
-        self.possible_agents = list(AGENTS)
-        self.agents: list[str] = []
         self.action_spaces = {agent: spaces.Discrete(n) for agent, n in choices.items()}
         self.observation_spaces = {
             agent: planes
@@ -447,14 +378,6 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
     def plan(self) -> Plan:
         """The boxes placed so far in this episode, in their order."""
         return self._game.plans()[0]
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the agent's observation space, the same object at each call."""
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the agent's action space, the same object at each call."""
-        return self.action_spaces[agent]
 
     # --- the game ---------------------------------------------------------------------------------
 
@@ -502,97 +425,30 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
             episode = int(game.episode)
         self._seed, self._episode, self._game = seed, episode, game
 
-        self.agents = list(AGENTS)
-        self.agent_selection = ORIENTATION
-        self.rewards = dict.fromkeys(AGENTS, 0.0)
-        self._cumulative_rewards = dict.fromkeys(AGENTS, 0.0)
-        self.terminations = dict.fromkeys(AGENTS, False)
-        self.truncations = dict.fromkeys(AGENTS, False)
-        self._cycle = 0
-        self._chosen = None
+        self._begin()
         self._read_game()
         self.infos = {agent: self._info(agent) for agent in AGENTS}
 
-    def step(self, action: int | None) -> None:
-        """Play the selected agent's action; None once that agent has ended.
-
-        Raises:
-            ValueError: for an action that is not a whole number in its action space, and for an
-                illegal action, unless ``illegal="repair"``.
-        """
-        _some_left(self.agents)
-        agent = self.agent_selection
-        if self.terminations[agent] or self.truncations[agent]:
-            self._was_dead_step(action)
-            return
-        choice, repaired = self._legal(agent, action)
-        self._cumulative_rewards[agent] = 0.0
-        self._clear_rewards()
-        if self._chosen is not None:
-            self._place(self._chosen, choice)
-        elif self._orientation_mask[choice] and (self._all_masked or self._masks[choice].any()):
-            self._chosen = choice
+    def _choose(self, orientation: int) -> None:
+        if self._orientation_mask[orientation] and (
+            self._all_masked or self._masks[orientation].any()
+        ):
+            self._chosen = orientation
         else:  # only without mask_orientations: the episode ends and nothing is placed
-            self._place(choice, 0)
-        self.agent_selection = self._acting
-        self.infos = {name: self._info(name) for name in self.agents}
-        if repaired:
-            self.infos[agent]["repaired"] = True
-        if self.render_mode == "human":
-            self.render()
+            self._place(orientation, 0)
 
-    def _place(self, orientation: int, cell: int) -> None:
-        self._orientation_played[0], self._cell_played[0] = orientation, cell
+    def _place(self, orientation: int, choice: int) -> None:
+        self._orientation_played[0], self._cell_played[0] = orientation, choice
         outcome = self._game.place(  # step has checked that it is legal
             torch.from_numpy(self._orientation_played),
             torch.from_numpy(self._cell_played),
             check=False,
         )
-        self._cycle += 1
-        self._chosen = None
         self._read_game()
-        ended = bool(outcome.done)
-        out_of_time = self.max_cycles is not None and self._cycle >= self.max_cycles
-        self.rewards = dict.fromkeys(self.agents, float(outcome.reward))
-        self.terminations = dict.fromkeys(self.agents, ended)
-        self.truncations = dict.fromkeys(self.agents, out_of_time and not ended)
-        self._accumulate_rewards()
+        self._placed(float(outcome.reward), bool(outcome.done))
 
-    def last(self, observe: bool = True) -> Any:
-        """Return observation, reward, termination, truncation and info of the acting agent.
-
-        Raises:
-            ValueError: once no agent is left.
-        """
-        _some_left(self.agents)
-        return super().last(observe)
-
-    def check_action(self, agent: str, action: Any) -> int:
-        """Return an agent's action as an int.
-
-        Raises:
-            ValueError: unless it is a whole number in the agent's action space.
-        """
-        last = self._choices[agent] - 1
-        if type(action) is int and 0 <= action <= last:  # the usual case
-            return action
-        if type(action) in (np.ndarray, torch.Tensor) and action.ndim == 0:
-            action = action.item()
-        return whole_number(action, f"{agent}: action", 0, last)
-
-    def _legal(self, agent: str, action: Any) -> tuple[int, bool]:
-        """Return the action to play, and whether it replaces an illegal action."""
-        action = self.check_action(agent, action)
-        if self._is_legal(action):
-            return action, False
-        legal = np.flatnonzero(self.action_mask(agent))
-        if self.illegal != "repair":
-            raise ValueError(
-                f"{agent}: action {action} is not legal; {len(legal)} are, see its action_mask"
-            )
-        if self._chosen is None:
-            return int(legal[np.abs(legal - action).argmin()]), True
-        return self._game.floor.nearest(action, legal), True
+    def _nearest(self, action: int, legal: NDArray[np.intp]) -> int:
+        return self._game.floor.nearest(action, legal)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy or a pickle: everything except the window."""
@@ -610,24 +466,9 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         self._orientation_mask = game.orientation_mask.numpy()[0]
 
     @property
-    def _legal_actions(self) -> NDArray[np.bool_]:
+    def legal_actions(self) -> NDArray[np.bool_]:
         """The legal actions of the acting agent, bool [6] or [W · D]."""
         return self._orientation_mask if self._chosen is None else self._masks[self._chosen]
-
-    def can_play(self, action: int) -> bool:
-        """Return whether an action in the acting agent's space is legal, and the agent goes on."""
-        agent = self.agent_selection
-        ended = self.terminations[agent] or self.truncations[agent]
-        return not ended and self._is_legal(action)
-
-    def _is_legal(self, action: int) -> bool:
-        legal = self._legal_actions
-        return action < legal.size and bool(legal[action])
-
-    @property
-    def _acting(self) -> str:
-        """The agent whose turn it is: the placement agent once an orientation is chosen."""
-        return AGENTS[self._chosen is not None]
 
     def _sides(self, oriented: bool) -> NDArray[np.int16]:
         """Return the item's sides as it comes, or along x, y, z in the chosen orientation."""
@@ -642,23 +483,6 @@ class raw_env(Copied, AECEnv):  # noqa: N801  # PettingZoo's name for it
         turn = self._chosen is not None
         _fill_planes(heightmap, self._item, orientation, self._unit, turn, planes)
         return planes
-
-    def action_mask(self, agent: str) -> NDArray[np.int8]:
-        """Return the agent's mask of legal actions, all 0 if it is not the agent's turn."""
-        mask = np.zeros(self._choices[agent], np.int8)
-        if agent == self._acting:
-            legal = self._legal_actions
-            mask[: legal.size] = legal
-        return mask
-
-    def _info(self, agent: str) -> dict[str, Any]:
-        info: dict[str, Any] = {
-            "utilization": self.utilization,
-            "packed": self._packed,
-        }
-        if self.mask_in == "info":
-            info["action_mask"] = self.action_mask(agent)
-        return info
 
     def observe(self, agent: str) -> Any:
         """Return the agent's observation; this works in both agents' turns and after the end."""
@@ -738,27 +562,6 @@ def _fill_planes(
         planes[4] = turn
 
 
-def _some_left(agents: Sequence[str]) -> None:
-    """Raise ValueError if no agent is left to act."""
-    if not agents:
-        raise ValueError("no agent is left to act: begin an episode with reset()")
-
-
-def _check_actions(env: raw_env, agents: Sequence[str], actions: Any) -> None:
-    """Raise ValueError unless the actions of ``agents`` are in a mapping, and in their spaces."""
-    if not hasattr(env, "agent_selection"):
-        raise ValueError("no episode has begun: begin one with reset()")
-    for agent in agents:
-        if not isinstance(actions, Mapping) or agent not in actions:
-            raise ValueError(f"actions: needs a dict with the action of {agent}")
-        env.check_action(agent, actions[agent])
-
-
-def _one_of(name: str, value: str, valid: Sequence[str]) -> None:
-    if value not in valid:
-        raise ValueError(f"{name} = {value!r}: one of {', '.join(map(repr, valid))}")
-
-
 def _name_options(function: Any) -> None:
     """Add every option that a function passes on to :class:`raw_env` to its signature."""
     named = [
@@ -770,6 +573,6 @@ def _name_options(function: Any) -> None:
     function.__signature__ = signature.replace(parameters=[*named, *own])
 
 
-raw_env.__signature__ = with_options(inspect.signature(raw_env), leave_out=tuple(TAKEN))
+raw_env.__signature__ = with_options(GameSpec, inspect.signature(raw_env), leave_out=tuple(TAKEN))
 _name_options(env)
 _name_options(parallel_env)

@@ -22,7 +22,7 @@ from pettingzoo.test import (
 from pettingzoo.test.state_test import state_test
 from pettingzoo.utils import wrappers
 
-from marl_pack import env_aec
+from marl_pack import env_aec, env_turns
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import ORIENTATIONS
@@ -457,8 +457,8 @@ def test_wrappers_are_in_pettingzoos_order() -> None:
             env = env.env
         return [*out, type(env)]
 
-    assert issubclass(env_aec.OrderEnforcing, wrappers.OrderEnforcingWrapper)
-    outer = [env_aec.OrderEnforcing, wrappers.AssertOutOfBoundsWrapper]
+    assert issubclass(env_turns.OrderEnforcing, wrappers.OrderEnforcingWrapper)
+    outer = [env_turns.OrderEnforcing, wrappers.AssertOutOfBoundsWrapper]
     assert chain(env_aec.env()) == [*outer, wrappers.TerminateIllegalWrapper, env_aec.raw_env]
     assert chain(env_aec.env(illegal="repair")) == [*outer, env_aec.raw_env]
 

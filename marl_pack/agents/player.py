@@ -15,7 +15,8 @@ from marl_pack.agents.policy import InTurns, Placement, Policy
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
-from marl_pack.env_aec import AGENTS, AtOnce, raw_env
+from marl_pack.env_aec import AGENTS, raw_env
+from marl_pack.env_turns import AtOnce
 from marl_pack.game.packing import Packing
 
 if TYPE_CHECKING:

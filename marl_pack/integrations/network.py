@@ -1,7 +1,8 @@
-"""A small masked actor-critic for the PettingZoo environment, in plain PyTorch.
+"""Small masked actor-critics for the PettingZoo environments, in plain PyTorch.
 
-It reads the observations of :mod:`marl_pack.env_aec` and works for any bin size. You may copy and
-change it. The agents of ``marl-pack train`` are larger and observe more.
+:class:`ActorCritic` reads the observations of :mod:`marl_pack.env_aec` and works for any bin size;
+:class:`MovesActorCritic` reads those of :mod:`marl_pack.env_mm`. You may copy and change them. The
+agents of ``marl-pack train`` are larger and observe more.
 """
 
 from __future__ import annotations
@@ -74,3 +75,50 @@ class ActorCritic(nn.Module):
                 orientations = nn.functional.pad(self.orientations(pooled), (0, mask.shape[1] - 6))
                 logits = torch.where(planes[:, 4, 0, 0, None] > 0, logits, orientations)
         return logits.masked_fill(~legal, FORBIDDEN), self.critic(pooled).squeeze(1)
+
+
+class MovesActorCritic(nn.Module):
+    """A network that computes logits and the state's value from one agent's list of moves and mask.
+
+    Every move is encoded alone; means and maxima over all moves describe the state.
+
+    Args:
+        agent: ``"orientation"`` scores six orientations, ``"placement"`` scores every move.
+        columns: numbers in a row, ``len(marl_pack.env_mm.COLUMNS)``.
+        channels: number of feature channels.
+    """
+
+    def __init__(self, agent: str, columns: int, channels: int = 64) -> None:
+        super().__init__()
+        if agent not in ("orientation", "placement"):
+            raise ValueError(f"agent {agent!r}: one of orientation, placement")
+        self.agent = agent
+        self.encoder = nn.Sequential(
+            nn.Linear(columns, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU()
+        )
+        self.orientations = nn.Linear(2 * channels, 6)
+        self.context = nn.Linear(2 * channels, channels)
+        self.cells = nn.Linear(channels, 1)  # the score of a move
+        self.critic = nn.Sequential(nn.Linear(2 * channels, 64), nn.ReLU(), nn.Linear(64, 1))
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the network's weights."""
+        return self.cells.weight.device
+
+    def forward(self, moves: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return masked logits [B, n] and values [B].
+
+        Args:
+            moves: float [B, K, F], a row for each move; the first number of a row is 1 for a move.
+            mask: [B, n], nonzero where an action is legal.
+        """
+        features = self.encoder(moves) * moves[..., :1]
+        count = moves[..., 0].sum(1, keepdim=True).clamp(min=1)
+        pooled = torch.cat((features.sum(1) / count, features.amax(1)), 1)
+        if self.agent == "orientation":
+            logits = self.orientations(pooled)
+        else:
+            context = self.context(pooled)[:, None]
+            logits = self.cells(torch.relu(features + context)).squeeze(2)
+        return logits.masked_fill(~mask.bool(), FORBIDDEN), self.critic(pooled).squeeze(1)
