@@ -12,6 +12,7 @@ from docstring_parser import parse
 
 from marl_pack import env_aec
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES
+from marl_pack.exact.spec import ExactSpec
 from marl_pack.export import OUTPUTS, example
 from marl_pack.game.spec import GameSpec
 
@@ -108,7 +109,20 @@ def between(page: str, name: str, text: str) -> str:
     return re.sub(pattern, lambda part: f"{part[1]}{text}\n{part[2]}", page, flags=re.DOTALL)
 
 
-PAGES = {"environment.md": environment_page, "onnx.md": onnx_page}
+def millimetres_page(page: str) -> str:
+    """Return docs/millimetres.md with its rows of options."""
+    rows = [("option", "default", "")]
+    for option in fields(ExactSpec):
+        sentence = option.metadata["sentence"].replace("null", "None")
+        rows.append((f"`{option.name}`", f"`{option.default!r}`", sentence))
+    return between(page, "options", table(*rows))
+
+
+PAGES = {
+    "environment.md": environment_page,
+    "onnx.md": onnx_page,
+    "millimetres.md": millimetres_page,
+}
 """Each page that the code determines, with the function that makes it from the one before."""
 
 

@@ -10,6 +10,12 @@ from .env_aec import env as env
 from .env_aec import parallel_env as parallel_env
 from .env_aec import raw_env as raw_env
 from .evaluation.statistics import strict_equilibrium as strict_equilibrium
+from .exact.bins import ExactBins as ExactBins
+from .exact.goods import Goods as Goods
+from .exact.packing import ExactPacking as ExactPacking
+from .exact.policies import make_exact_policy as make_exact_policy
+from .exact.spec import ExactSpec as ExactSpec
+from .exact.stable_place import stable_place as stable_place
 from .game.packing import Packing as Packing
 from .game.spec import GameSpec as GameSpec
 from .game.turns import Outcome as Outcome

@@ -120,6 +120,23 @@ def _training() -> None:
     make_runner(settings, None).train(1)
 
 
+def _millimetres() -> None:
+    """Play the game in millimetres under every rule, with every heuristic and at random."""
+    from marl_pack.exact.limits import RULES
+    from marl_pack.exact.packing import ExactPacking
+    from marl_pack.exact.policies import NAMES, make_exact_policy
+
+    sides = [[300, 200, 250], [400, 300, 200], [200, 200, 200]] * 3
+    for rule in RULES:
+        for name in NAMES if rule == "lbcp" else ("max_contact", "random"):
+            game = ExactPacking(2, sides, rule=rule, auto_reset=False)
+            policy = make_exact_policy(name)
+            for _ in range(STEPS):
+                if game.alive.any():
+                    game.place(policy(game))
+            game.plan(0)
+
+
 PARTS: dict[str, Callable[[], None]] = {
     "rules": _rules,
     "games": _games,
@@ -127,6 +144,7 @@ PARTS: dict[str, Callable[[], None]] = {
     "heuristics": _policies,
     "agents": _agents,
     "environments": _environments,
+    "millimetres": _millimetres,
     "training": _training,
 }
 """The parts of the package whose code is compiled, by name."""

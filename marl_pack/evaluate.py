@@ -22,10 +22,18 @@ from rich.progress import Progress
 from rich.table import Table
 
 from marl_pack.checks import whole_number
-from marl_pack.evaluation.rollout import Rollout, batches
+from marl_pack.evaluation.rollout import Rollout
 from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
 from marl_pack.files import Growing, check_writable, same_plain_file, write_json
-from marl_pack.options import GAME_NOTE, MOST_AT_ONCE, add_options, check_names
+from marl_pack.options import (
+    GAME_NOTE,
+    MOST_AT_ONCE,
+    ONLY_CELLS,
+    ONLY_MM,
+    add_mm_options,
+    add_options,
+    check_names,
+)
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
 from marl_pack.plan_archive import check_ending, save_plans
 from marl_pack.sapien_check.bodies import Bodies
@@ -34,8 +42,8 @@ from marl_pack.sapien_check.world import SimulationError, load_sapien
 from marl_pack.terminal import PIPED_WIDTH, Parser, make_console, make_progress, make_status
 
 if TYPE_CHECKING:
-    from marl_pack.agents.policy import Policy
     from marl_pack.players import Setup
+    from marl_pack.players_mm import SetupMm
 
 PROGRAM = "python -m marl_pack.evaluate"
 EPISODES = 1000  # default number of episodes of a generated stream
@@ -108,9 +116,11 @@ def parser(program: str = PROGRAM) -> Parser:
             "--policy runs/NAME --items boxes.csv --bin 12 10 14 --json figures.json",
             "--policy rs --plan rollouts=16,top=8 --episodes 20",
             "--policy rs --episodes 100 --physics --save-stacks plans.csv",
+            "--world mm --items boxes_mm.csv --bin-mm 1200 800 1500 --margin-mm 20",
         ),
     )  # fmt: skip
     add_options(options)
+    add_mm_options(options)
     options.add_argument_group("episodes").add_argument(
         "--episodes", type=int,
         help=f"number of episodes (default: {EPISODES}; all sequences of a file)",
@@ -150,7 +160,9 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--json, --save-stacks: {arguments.json}: need two files")
 
 
-def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bodies | None]:
+def check_options(
+    arguments: argparse.Namespace, setup: Setup | SetupMm
+) -> tuple[int, Bodies | None]:
     """Check the options; return the number of episodes, and the bodies with ``--physics``.
 
     Raises:
@@ -175,8 +187,8 @@ def check_options(arguments: argparse.Namespace, setup: Setup) -> tuple[int, Bod
 
 def evaluate_policy(
     name: str,
-    policy: Policy,
-    setup: Setup,
+    policy: Any,
+    setup: Setup | SetupMm,
     episodes: int,
     bodies: Bodies | None,
     bar: Progress,
@@ -192,7 +204,7 @@ def evaluate_policy(
     stacks = Growing(arguments.save_stacks, partial(save_plans, policy=name))
     row: dict[str, Any] = {}
     try:
-        for part in batches(policy, setup.game, episodes, lambda ended: bar.advance(task, ended)):
+        for part in setup.batches(policy, episodes, lambda ended: bar.advance(task, ended)):
             for e, plan in enumerate(part.plans, len(rollout.plans)):
                 balanced[e] = strict_equilibrium(plan)
                 bar.advance(solving)
@@ -223,6 +235,40 @@ def evaluate_policy(
         console.print(f"{name}: {unjudged} episodes without a verdict", soft_wrap=True)
 
 
+def check_world(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go with the world, and names that do not exist.
+
+    Raises:
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
+    """
+    in_mm = arguments.world == "mm"
+    for name in ONLY_CELLS if in_mm else ONLY_MM:
+        if getattr(arguments, name) is not None:
+            flag = "--" + name.replace("_", "-")
+            raise ValueError(f"{flag}: goes with --world {'cells' if in_mm else 'mm'}")
+    if not in_mm:
+        check_names(arguments)
+    elif arguments.symmetric or arguments.device != "cpu":
+        raise ValueError("--world mm: --symmetric and --device go with --world cells")
+
+
+def choose_setup(arguments: argparse.Namespace, console: Console) -> Setup | SetupMm:
+    """Return the policies and the game that the options name.
+
+    Raises:
+        ValueError, FileNotFoundError: if an option is impossible; says what would be right.
+    """
+    with make_status(console, "loading the players"):
+        if arguments.world == "mm":
+            from marl_pack.players_mm import choose_mm
+
+            return choose_mm(arguments, console)
+        from marl_pack.players import choose, set_threads  # slow to import
+
+        set_threads(arguments.threads)
+        return choose(arguments, console)
+
+
 def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, Any]]:
     """Play the policies that the options choose; return a row of figures for each.
 
@@ -232,13 +278,9 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, dict[str, 
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
-    check_names(arguments)
+    check_world(arguments)
     check_outputs(arguments)
-    with make_status(console, "loading the players"):
-        from marl_pack.players import choose, set_threads  # slow to import
-
-        set_threads(arguments.threads)
-        setup = choose(arguments, console)
+    setup = choose_setup(arguments, console)
     episodes, bodies = check_options(arguments, setup)
     bar = make_progress(console)
     title = str(setup)

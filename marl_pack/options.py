@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 
 from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.agents.sources import check_source, path_of, resolve
-from marl_pack.game.spec import add_arguments
+from marl_pack.exact.spec import ORDERS, ExactSpec
+from marl_pack.game.spec import GameSpec
 from marl_pack.items import GENERATED
 from marl_pack.items.generated import no_such_file
+from marl_pack.option_record import add_arguments
 
+WORLDS = ("cells", "mm")
+COMMON = frozenset(each.name for each in fields(GameSpec)) & {
+    each.name for each in fields(ExactSpec)
+}
+"""Options that games on cells have, too."""
+ONLY_CELLS = ("sides", "bin", "margin", "mask_orientations", "com_offset", "max_items",
+              "orientation", "placement", "plan")  # fmt: skip
+ONLY_MM = (*(each.name for each in fields(ExactSpec) if each.name not in COMMON), "order", "length")
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
 GAME_NOTE = """\
@@ -46,13 +57,31 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--sides", nargs=2, type=int, metavar=("SHORTEST", "LONGEST"),
         help="sides of generated items, in cells")  # fmt: skip
-    add_arguments(game)
+    add_arguments(game, GameSpec)
     add("--seed", type=int, default=0,
         help="seed of generated items, random play, futures of --plan and drawn bodies "
              "(default: 0)")  # fmt: skip
     add = options.add_argument_group("computation").add_argument
     add("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     add("--threads", type=int, default=1, help="threads on the CPU (default: 1)")
+
+
+def add_mm_options(options: argparse.ArgumentParser) -> None:
+    """Add ``--world`` and the options of games in millimetres to a command."""
+    group = options.add_argument_group("game in millimetres (--world mm)")
+    group.add_argument(
+        "--world", choices=WORLDS, default=WORLDS[0],
+        help="cells: whole cells (default); mm: true sizes in millimetres, from --items FILE",
+    )  # fmt: skip
+    group.add_argument(
+        "--order", choices=ORDERS,
+        help="file: the sequences of the file (default); draw: boxes drawn at random",
+    )  # fmt: skip
+    group.add_argument(
+        "--length", type=int, metavar="N",
+        help="boxes in an episode: of a file, its disjoint windows; needed with --order draw",
+    )  # fmt: skip
+    add_arguments(group, ExactSpec, leave_out=COMMON)
 
 
 def check_names(arguments: argparse.Namespace) -> None:

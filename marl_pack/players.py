@@ -7,6 +7,7 @@ Without a checkpoint the game is RS in a bin of 10 × 10 × 10 under ``hull_alph
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +19,9 @@ from marl_pack.agents.policy import InTurns, Policy
 from marl_pack.agents.sources import is_own
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, whole_number
+from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameSpec, given_options
+from marl_pack.game.spec import GameSpec
 from marl_pack.geometry import Size
 from marl_pack.items import (
     DEFAULT_SIDES,
@@ -27,6 +29,7 @@ from marl_pack.items import (
     Stream,
     choose_stream,
 )
+from marl_pack.option_record import given_options
 from marl_pack.options import MOST_AT_ONCE
 from marl_pack.terminal import announce_compiling
 
@@ -48,6 +51,12 @@ class Setup:
             n, items=self.stream, spec=self.spec, device=self.arguments.device,
             seed=self.arguments.seed, first_episode=first_episode, auto_reset=False,
         )  # fmt: skip
+
+    def batches(
+        self, policy: Policy, episodes: int, progress: Callable[[int], object]
+    ) -> Iterator[Rollout]:
+        """Play episodes in batches (:func:`marl_pack.evaluation.rollout.batches`)."""
+        return batches(policy, self.game, episodes, progress)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -104,7 +113,7 @@ def choose_game(
         arguments: the parsed options; an option that is not used is None.
         trained: the game that the first checkpoint was trained on; empty without a checkpoint.
     """
-    chosen = given_options(arguments)
+    chosen = given_options(arguments, GameSpec)
     if "rule" in chosen:  # margin and thresholds belong to the rule
         trained = trained | {"margin": None, "thresholds": None}
     items = str(trained.get("items", "rs") if arguments.items is None else arguments.items)

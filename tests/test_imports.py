@@ -9,25 +9,32 @@ PACKAGE = ROOT / "marl_pack"
 
 # A module may import from its own layer and from those before it.
 LAYERS = (
-    ("backend", "checks", "extras", "files", "inputs", "installation", "published", "renamed",
+    ("backend", "checks", "extras", "files", "inputs", "installation", "option_record", "published",
+     "renamed",
      "terminal"),
     ("geometry",),
     ("bins", "items", "plan", "plan_archive", "render"),
     ("stability", "sapien_check"),
+    ("exact",),
     ("game",),
-    ("env_aec", "vec_env", "agents"),
+    ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
     ("evaluation",),
     # The programs, and what only they use.
     ("cli", "compile", "config", "evaluate", "export", "integrations", "options", "physics", "play",
-     "players", "train", "training"),
+     "players", "players_mm", "train", "training", "tune"),
 )  # fmt: skip
 
 # What the judge and the environment must not need.
 ONLY = {
     "sapien_check": {"bins", "checks", "extras", "files", "geometry", "plan", "sapien_check"},
-    "env_aec": {"bins", "checks", "game", "geometry", "installation", "items", "plan", "render"},
+    "env_aec": {"bins", "checks", "env_mm", "env_turns", "game", "geometry", "installation",
+                "items", "option_record", "plan", "render"},
+    "env_mm": {"checks", "env_turns", "exact", "geometry", "option_record", "plan", "render"},
+    "env_turns": {"checks", "game"},
+    "exact": {"checks", "exact", "extras", "geometry", "inputs", "installation", "items",
+              "option_record", "plan", "renamed", "sapien_check", "stability"},
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
-             "renamed", "stability"},
+             "option_record", "renamed", "stability"},
     "render": {"bins", "files", "geometry", "plan", "render"},
 }  # fmt: skip
 

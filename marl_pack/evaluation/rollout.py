@@ -15,10 +15,13 @@ from marl_pack.plan import Plan
 
 if TYPE_CHECKING:
     from marl_pack.agents.policy import Policy
+    from marl_pack.exact.packing import ExactPacking
+    from marl_pack.exact.policies import ExactPolicy
     from marl_pack.game.packing import Packing
 
 BATCH = 1024  # games played at once, at most
 BATCH_CELLS = 1 << 20  # cells in the maps of their bins, at most
+BATCH_MM = 256  # games in millimetres played at once, at most
 
 
 @dataclass(frozen=True)
@@ -81,3 +84,31 @@ def batches(
             outcome = games.place(*policy(games))
             progress(int(outcome.done.sum()))
         yield Rollout(games.plans(), time.perf_counter() - start)
+
+
+def batches_mm(
+    policy: ExactPolicy,
+    game: Callable[[int, int], ExactPacking],
+    episodes: int,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Iterator[Rollout]:
+    """Play episodes in millimetres in batches, like :func:`batches`.
+
+    Args:
+        policy: chooses the moves.
+        game: (n, first_episode) → n games without ``auto_reset``.
+        episodes: number of episodes, E.
+        progress: called with the number of episodes that have just ended.
+
+    Raises:
+        ValueError: unless ``episodes`` is a whole number ≥ 1.
+    """
+    episodes = whole_number(episodes, "episodes", 1)
+    for first in range(0, episodes, BATCH_MM):
+        games = game(min(BATCH_MM, episodes - first), first)
+        progress(int((~games.alive).sum()))
+        start = time.perf_counter()
+        while games.alive.any():
+            outcome = games.place(policy(games))
+            progress(int(outcome.done.sum()))
+        yield Rollout([games.plan(g) for g in range(games.n)], time.perf_counter() - start)
