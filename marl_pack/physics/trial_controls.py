@@ -11,8 +11,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from marl_pack.physics import controls
 from marl_pack.plan import Plan
 from marl_pack.sapien_check.stack import Stack

@@ -71,7 +71,7 @@ class Descent:
                 k = free.argmax()
                 middle = np.array([*places[k], rest[k]])
                 fits = np.linalg.norm(middle - self.planned) <= self.distance
-                return middle + [0.0, 0.0, self.drop] if fits else None
+                return middle + np.array([0.0, 0.0, self.drop]) if fits else None
         return None
 
     def _rest(self, places: Floats, standing: Standing) -> tuple[Floats, NDArray[np.bool_]]:
