@@ -16,6 +16,7 @@ from marl_pack.physics.command import main
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check import SimulationError, Stack, Trial, run_trial, run_trials
+from marl_pack.sapien_check import trials as trials_module
 from marl_pack.sapien_check.insertion import (
     Descent,
     Standing,
@@ -23,6 +24,7 @@ from marl_pack.sapien_check.insertion import (
     rotation_matrices,
 )
 from marl_pack.sapien_check.trials import Errors
+from marl_pack.sapien_check.world import Pass
 
 BIN = (600.0, 600.0, 1000.0)
 CONTROLS = trial_controls.all_controls()
@@ -75,6 +77,25 @@ def test_thin_boards_and_a_box_on_a_lower_top_have_a_result() -> None:
                              (100, 0, 200, 400, 300, 100)))  # fmt: skip
     assert result.collapse is None
     assert 0.1 < result.angle < 2
+
+
+def test_boards_on_boxes_do_not_creep() -> None:
+    rows = []
+    for z in range(0, 1600, 200):
+        rows += [(x, 0, z, 300, 1200, 170) for x in (0, 1000, 2100)]
+        rows.append((0, 0, z + 170, 2400, 900, 30))
+    result = run_trial(Stack.of_plan(Plan.of_boxes((2400.0, 1200.0, 1600.0), rows, unit_mm=1.0)))
+    assert result.distance < 0.002
+
+
+def test_a_collapse_has_to_happen_in_the_finer_simulation_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pile, coarse, fine = stack(*STABLE), Pass(1 / 15, 1), Pass(1 / 240, 50)
+    monkeypatch.setattr(trials_module, "PASSES", {10.0: (coarse,)})
+    assert run_trial(pile).collapse is not None
+    monkeypatch.setattr(trials_module, "PASSES", {10.0: (coarse, fine)})
+    assert run_trial(pile).collapse is None
 
 
 def test_utilization_in_physics_counts_what_stood_before_the_collapse() -> None:
@@ -158,7 +179,8 @@ def test_an_empty_stack_survives() -> None:
     ({"size_error": 0.6}, "size_error = 0.6: needs a share from 0 to 0.5"),
     ({"drop": -0.001}, "drop = -0.001: needs metres from 0 to 10"),
     ({"tilt": 90}, "tilt = 90: needs degrees from 0 to 89"),
-    ({"shake": float("nan")}, "shake = nan: needs g from 0 to 10"),
+    ({"shake": float("nan")}, "shake: needs a finite number, not nan"),
+    ({"shake": 11}, "shake = 11: needs g from 0 to 10"),
     ({"frequency": 0}, "frequency = 0: needs Hz from 0.1 to 30"),
     ({"give": 0.2}, "give = 0.2: needs metres from 0 to 0.1"),
     ({"friction": -1}, "friction = -1: needs a number from 0"),

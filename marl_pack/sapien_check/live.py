@@ -41,7 +41,7 @@ class LiveWorld(World):
 
     # TGS divides each step by its iterations. Over the minutes of a trial the steps become so short
     # that rounding lets boxes slide by centimetres. PGS (projected Gauss-Seidel) does not do that.
-    temporal = False
+    tgs = False
 
     def __init__(self, boxes: Stack, physics: Physics, step: Pass) -> None:
         super().__init__(boxes.first(0), physics, step)

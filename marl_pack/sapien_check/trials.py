@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from marl_pack.checks import LARGEST_SEED, truth_value, whole_number
+from marl_pack.checks import LARGEST_SEED, real_number, truth_value, whole_number
 from marl_pack.sapien_check.insertion import Descent
 from marl_pack.sapien_check.live import LiveWorld
 from marl_pack.sapien_check.processes import in_order
@@ -71,8 +71,8 @@ class Trial:
             "place_error": (0, 1, "metres"), "yaw": (0, 180, "degrees"),
         }  # fmt: skip
         for name, (low, high, unit) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:  # NaN is refused, too
+            value = real_number(getattr(self, name), name)
+            if not low <= value <= high:
                 raise ValueError(f"{name} = {value:g}: needs {unit} from {low:g} to {high:g}")
         for name, limit in (("place_error", "distance"), ("yaw", "angle")):
             if getattr(self, name) >= getattr(self, limit):

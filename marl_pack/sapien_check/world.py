@@ -92,14 +92,14 @@ class World:
         groups: the result of :func:`collision_groups`, if the caller has computed it.
     """
 
-    temporal = True  # whether the solver is TGS; else PGS
+    tgs = True  # whether the solver is TGS; else PGS
 
     def __init__(
         self, stack: Stack, physics: Physics, step: Pass, groups: list[list[int]] | None = None
     ) -> None:
         sapien = self.sapien = load_sapien()
         physx = sapien.physx
-        physx.set_scene_config(enable_tgs=self.temporal, enable_pcm=True, enable_ccd=False)
+        physx.set_scene_config(enable_tgs=self.tgs, enable_pcm=True, enable_ccd=False)
         physx.set_body_config(
             solver_position_iterations=step.iterations, solver_velocity_iterations=1,
             sleep_threshold=0.0,
