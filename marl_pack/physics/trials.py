@@ -172,7 +172,7 @@ def in_words(figures: dict[str, Any]) -> str:
     causes = ", ".join(f"{count} in a {cause}" for cause, count in figures["causes"].items())
     error = spread(figures["in_physics"], figures["in_physics_interval"])
     return (
-        f"{figures['trials']:,} trials: {figures['collapses']} collapses"
+        f"{figures['trials']:,} trials: {figures['collapses']} collapsed"
         f"{f' ({causes})' if causes else ''}, {share:.1f} % (95 % interval {low:.1f} to "
         f"{high:.1f} %)\n"
         f"{figures['left_out']} of {figures['boxes']:,} boxes could not be inserted\n"

@@ -76,8 +76,7 @@ class Descent:
 
     def _rest(self, places: Floats, standing: Standing) -> tuple[Floats, NDArray[np.bool_]]:
         """Return, for k places, the height of the middle at rest, and whether the way is free."""
-        pressed = self.half - np.minimum(PRESS, self.half / 10)
-        half = np.array([*pressed[:2], self.half[2]])
+        half = self.half - np.minimum(PRESS, self.half / 10) * (1, 1, 0)
         low, high = overlap_heights(half, self.yaw, places, standing)
         meet, under = low < high, standing.under
         rest = np.where(meet & under, high, -np.inf).max(1, initial=self.half[2])

@@ -102,7 +102,7 @@ class LiveWorld(World):
             body.set_angular_velocity(np.zeros(3))
 
     def tilt(self, degrees: float, direction: Floats) -> None:
-        """Turn gravity slowly to a direction [2], and hold it until everything rests or falls."""
+        """Turn gravity slowly to a direction [2] by an angle, and hold it for a while."""
         for angle in np.arange(0.0, degrees, TILT_SPEED * self.system.timestep):
             self._lean(float(angle), direction)
             self.run(self.system.timestep)

@@ -65,7 +65,7 @@ class Trial:
     def __post_init__(self) -> None:
         limits = {
             "size_error": (0, 0.5, "a share"), "drop": (0, 10, "metres"),
-            "tilt": (0, 89, "degrees"), "shake": (0, 10, "g"), "frequency": (0.1, 30, "Hz"),
+            "tilt": (0, 89, "degrees"), "shake": (0, 3, "g"), "frequency": (0.5, 30, "Hz"),
             "give": (0, 0.1, "metres"), "friction": (0, 1000, "a number"),
             "distance": (0.001, 1, "metres"), "angle": (0.1, 180, "degrees"),
             "place_error": (0, 1, "metres"), "yaw": (0, 180, "degrees"),
