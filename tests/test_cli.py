@@ -45,7 +45,10 @@ MISTAKES = [
     ("export rs --formt onnx", "did you mean '--format'"),
     ("play --pictures bin.png", "did you mean '--picture'"),
     ("play --save plan", "--save plan: needs one of the endings"),
-    ("judge tabel1", "'tabel1': needs one of table1, controls, stack; did you mean 'table1'"),
+    (
+        "judge tabel1",
+        "'tabel1': needs one of table1, controls, stack, trial; did you mean 'table1'",
+    ),
     ("judge table1 --rules hull", "'hull': needs one of .*; did you mean 'hull_1'"),
     ("judge stack --episods 3", "unknown option '--episods'; did you mean '--episodes'"),
     ("train --ppo.lamm=1", "'ppo.lamm'; did you mean 'ppo.lam'"),

@@ -28,6 +28,14 @@ def interval(values: NDArray[np.floating[Any]]) -> tuple[float, float] | None:
     return float(bounds.low), float(bounds.high)
 
 
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Compute the 95 % interval of a share (Wilson's score), from a count of 1 or more trials."""
+    from scipy import stats  # slow to import
+
+    bounds = stats.binomtest(count, total).proportion_ci(0.95, method="wilson")
+    return float(bounds.low), float(bounds.high)
+
+
 def mean_utilization(rollout: Rollout) -> dict[str, Any]:
     """Compute mean utilization with its 95 % interval over episodes, and items packed.
 

@@ -3,7 +3,8 @@
 - ``table1``: measure the paper's Table 1, for objects placed at random under a stability rule;
 - ``controls``: judge stacks with a known verdict, and find the margins at which the judge's verdict
   flips;
-- ``stack FILE``: judge packings saved by ``marl-pack evaluate --save-stacks``, or draw one of them.
+- ``stack FILE``: judge packings saved by ``marl-pack evaluate --save-stacks``, or draw one of them;
+- ``trial FILE``: build such packings with the errors of a robot, tilt them and shake them.
 
 ``python -m marl_pack.sapien_check`` is the same command.
 """
@@ -26,8 +27,8 @@ from rich.table import Table
 from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.files import Growing, check_writable, write_json
 from marl_pack.options import MOST_AT_ONCE
-from marl_pack.physics import controls, table1
-from marl_pack.physics.options import add_body_options, chosen_bodies
+from marl_pack.physics import controls, table1, trials
+from marl_pack.physics.options import add_file_options, chosen_bodies, chosen_episodes
 from marl_pack.plan_archive import load_plans, save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, Verdict, judge_all
@@ -210,11 +211,7 @@ def run_stack(options: argparse.Namespace, console: Console) -> None:
     """Draw one saved packing (``--render``), judge packings, and print and write the verdicts."""
     plans = load_plans(options.file)
     bodies = chosen_bodies(options)
-    every = range(len(plans))
-    chosen = every if options.episodes is None else list(dict.fromkeys(options.episodes))
-    for e in chosen:
-        if e not in every:
-            raise ValueError(f"--episodes {e}: needs numbers from 0 to {len(every) - 1}")
+    chosen = chosen_episodes(options, plans)
     if options.render is not None:
         if len(chosen) != 1:
             raise ValueError("--render: needs one stack; choose it with --episodes K")
@@ -316,6 +313,7 @@ def parser(program: str = PROGRAM) -> Parser:
         examples=(
             "stack plans.npz",
             "stack plans.npz --episodes 3 --render film.mp4",
+            "trial plans.npz --place-error 5 1 --drop 5",
             "controls",
             "table1 --objects 3000 --processes 2",
         ),
@@ -325,11 +323,14 @@ def parser(program: str = PROGRAM) -> Parser:
     add = common.add_argument_group("physics").add_argument
     add("--friction", type=float, default=DEFAULT.friction,
         help=f"friction between all faces (default: {DEFAULT.friction})")  # fmt: skip
-    add("--everything", action="store_true",
-        help="let all boxes and the walls collide, as in a real bin; then neighbours may prop up "
-             "boxes that would fall")  # fmt: skip
     add = common.add_argument_group("output").add_argument
     add("--json", type=Path, metavar="FILE", help="write the results to this file")
+    colliding = Parser(add_help=False)
+    colliding.add_argument_group("collisions").add_argument(
+        "--everything", action="store_true",
+        help="let all boxes and the walls collide, as in a real bin; then neighbours may prop up "
+             "boxes that would fall",
+    )  # fmt: skip
     parallel = Parser(add_help=False)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     hint = f"processes that work at once (default: 1; this computer has {cores} cores)"
@@ -338,7 +339,7 @@ def parser(program: str = PROGRAM) -> Parser:
     )
 
     table = commands.add_parser(
-        "table1", parents=[common, parallel], help="the paper's Table 1",
+        "table1", parents=[common, colliding, parallel], help="the paper's Table 1",
         description=table1.__doc__,
         examples=("--objects 300", "--rules hull_1 hull_alpha lbcp --json table1.json"),
     )  # fmt: skip
@@ -352,34 +353,38 @@ def parser(program: str = PROGRAM) -> Parser:
         help="save the bins in which something fell as FILE_RULE.npz; judge stack reads "
              "these files")  # fmt: skip
 
-    commands.add_parser(
-        "controls", parents=[common], help="stacks with a known verdict",
-        description=controls.__doc__, examples=("--json controls.json",),
+    known = commands.add_parser(
+        "controls", parents=[common, colliding], help="stacks with a known verdict",
+        description=controls.__doc__, examples=("--json controls.json", "--trials"),
     )  # fmt: skip
+    known.add_argument_group("choice").add_argument(
+        "--trials", action="store_true", help="run the controls of trials instead"
+    )
 
     stack = commands.add_parser(
-        "stack", parents=[common, parallel], help="packings saved by evaluate --save-stacks",
+        "stack", parents=[common, colliding, parallel],
+        help="packings saved by evaluate --save-stacks",
         description="Judge saved packings after each of their placements.",
         examples=("plans.npz --processes 2", "plans.csv --episodes 3 --render film.mp4"),
     )  # fmt: skip
-    stack.add_argument(
-        "file", type=Path, help="a file written by evaluate --save-stacks or play --save"
-    )  # fmt: skip
-    stack.add_argument(
-        "--episodes", nargs="+", type=int, metavar="K",
-        help="numbers of the episodes to judge (default: all)",
-    )  # fmt: skip
-    bodies = stack.add_argument_group("bodies")
-    add_body_options(bodies)
-    bodies.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        help="seed of random densities and centres of mass (default: 0)",
-    )
+    add_file_options(stack)
+    add = stack.add_argument_group("random numbers").add_argument
+    add("--seed", type=int, default=0,
+        help="seed of random densities and centres of mass (default: 0)")  # fmt: skip
     add = stack.add_argument_group("film").add_argument
     add("--render", type=Path, metavar="FILE",
         help="draw the stack being built, as a film (.mp4, .gif), or its end (.png)")  # fmt: skip
+
+    trial = commands.add_parser(
+        "trial", parents=[common, parallel],
+        help="packings in a real cell: errors of sizes and places, a tilt, a shake",
+        description=trials.__doc__,
+        examples=(
+            "plans.npz --place-error 5 1 --drop 5",
+            "plans.npz --tilt 5 --shake 0.3 2 --repeats 10 --json trials.json",
+        ),
+    )  # fmt: skip
+    trials.add_options(trial)
     return options
 
 
@@ -393,10 +398,14 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
         if options.json is not None:
             check_writable(options.json)
         options.physics = replace(
-            Physics(), friction=options.friction, everything=options.everything
+            Physics(), friction=options.friction, everything=getattr(options, "everything", False)
         )
         if options.command == "table1":
             run_table1(options, console)
+        elif options.command == "trial":
+            trials.run(options, console)
+        elif options.command == "controls" and options.trials:
+            return 0 if trials.run_controls(options, console) else 1
         elif options.command == "controls":
             return 0 if run_controls(options, console) else 1
         else:

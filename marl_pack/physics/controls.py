@@ -40,7 +40,7 @@ def exact_equilibrium(plan: Plan) -> bool:
     return in_equilibrium(boxes, np.column_stack((weights, plan.centres * SCALE)))
 
 
-def _plan(
+def plan_of(
     *rows: tuple[float, ...],
     mass: tuple[float, ...] | None = None,
     last_centre: tuple[float, float] = (0.0, 0.0),
@@ -63,7 +63,7 @@ def _plan(
 
 def cube(edge: float, margin: float) -> Plan:
     """Return two cubes: about half of the upper one protrudes over the edge of the lower one."""
-    return _plan((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
+    return plan_of((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
 
 
 def heavy_on_light(ratio: float, margin: float) -> Plan:
@@ -73,7 +73,7 @@ def heavy_on_light(ratio: float, margin: float) -> Plan:
     ``ratio`` times the mass of the light box.
     """
     middle = ((200 - margin) * (1 + ratio) - 150) / ratio
-    return _plan(
+    return plan_of(
         (0, 0, 0, 200, 200, 100), (0, 0, 100, 300, 200, 50), (middle - 50, 50, 150, 100, 100, 100),
         mass=(1, 1, ratio),
     )  # fmt: skip
@@ -91,13 +91,13 @@ def harmonic(count: int, margin: float) -> Plan:
         x = centre + slack - length  # the centre of all planks above lies ``slack`` inside its edge
         rows.append((x, 0.0, 50.0 * (count - 1 - above), length, 100.0, 50.0))
         centre = (centre * above + x + length / 2) / (above + 1)
-    return _plan(*rows[::-1])
+    return plan_of(*rows[::-1])
 
 
 def counterweight(margin: float) -> Plan:
     """Return a plank whose middle protrudes beyond a post, and a weight on its other end."""
     weight = (100 + margin) / (75 - margin)
-    return _plan(
+    return plan_of(
         (0, 0, 0, 100, 100, 100), (0, 0, 100, 400, 100, 20), (0, 25, 120, 50, 50, 50),
         mass=(1, 1, weight),
     )  # fmt: skip
@@ -106,7 +106,7 @@ def counterweight(margin: float) -> Plan:
 def diagonal(margin: float) -> Plan:
     """Return a plate on posts under opposite corners; its centre of mass is off the diagonal."""
     offset = 30 - margin / math.sqrt(2)
-    return _plan(
+    return plan_of(
         (0, 0, 0, 60, 60, 100), (240, 240, 0, 60, 60, 100), (0, 0, 100, 300, 300, 100),
         last_centre=(offset, -offset),
     )  # fmt: skip
@@ -114,7 +114,7 @@ def diagonal(margin: float) -> Plan:
 
 def bridge(margin: float) -> Plan:
     """Return a plate on two posts; its centre of mass is near the edge of their common support."""
-    return _plan(
+    return plan_of(
         (0, 0, 0, 80, 60, 150), (200, 0, 0, 100, 60, 150), (0, 0, 150, 300, 100, 40),
         last_centre=(0, 10 - margin),
     )  # fmt: skip
@@ -124,7 +124,7 @@ def propped(gap: float, edge: float, margin: float) -> Plan:
     """Return the stack of :func:`cube` and a tall box on the side to which the upper cube tips."""
     cubes = cube(edge, margin).boxes - [300, 300, 0, 0, 0, 0]
     neighbour_x = cubes[1, 0] + edge + gap
-    return _plan(*map(tuple, cubes), (neighbour_x, 0, 0, edge, edge, 3 * edge))
+    return plan_of(*map(tuple, cubes), (neighbour_x, 0, 0, edge, edge, 3 * edge))
 
 
 FAMILIES: dict[str, Callable[[float], Plan]] = {
@@ -143,7 +143,7 @@ FAMILIES: dict[str, Callable[[float], Plan]] = {
 
 def tower(count: int, edge: float) -> Plan:
     """Return a tower of ``count`` cubes."""
-    return _plan(*((0, 0, edge * k, edge, edge, edge) for k in range(count)))
+    return plan_of(*((0, 0, edge * k, edge, edge, edge) for k in range(count)))
 
 
 def wall_of_bricks() -> Plan:
@@ -153,7 +153,7 @@ def wall_of_bricks() -> Plan:
         ends = [0, 50, 150, 250, 300] if layer % 2 else [0, 100, 200, 300]
         for a, b in pairwise(ends):
             rows.append((a, 0, 40 * layer, b - a, 60, 40))
-    return _plan(*rows)
+    return plan_of(*rows)
 
 
 STANDING: dict[str, Callable[[], Plan]] = {

@@ -1,9 +1,12 @@
-"""Options of the commands that judge packings, for cells, densities and centres of mass."""
+"""Options of the commands that judge packings: files, cells, densities and centres of mass."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
+from marl_pack.plan import Plan
 from marl_pack.sapien_check.bodies import Bodies
 
 BODY_OPTIONS = ("cell", "density", "com_spread")
@@ -32,3 +35,29 @@ def chosen_bodies(options: argparse.Namespace) -> Bodies:
     """
     density = None if options.density is None else (options.density[0], options.density[1])
     return Bodies(options.cell, density, options.com_spread or 0.0, options.seed)
+
+
+def add_file_options(parser: argparse.ArgumentParser) -> None:
+    """Add the file of packings, ``--episodes``, and the options of their bodies to a command."""
+    parser.add_argument(
+        "file", type=Path, help="a file written by evaluate --save-stacks or play --save"
+    )
+    parser.add_argument(
+        "--episodes", nargs="+", type=int, metavar="K",
+        help="numbers of the episodes to judge (default: all)",
+    )  # fmt: skip
+    add_body_options(parser.add_argument_group("bodies"))
+
+
+def chosen_episodes(options: argparse.Namespace, plans: Sequence[Plan]) -> Sequence[int]:
+    """Return the numbers of the episodes that ``--episodes`` chooses; all by default.
+
+    Raises:
+        ValueError: if there is no such episode.
+    """
+    every = range(len(plans))
+    chosen = every if options.episodes is None else list(dict.fromkeys(options.episodes))
+    for e in chosen:
+        if e not in every:
+            raise ValueError(f"--episodes {e}: needs numbers from 0 to {len(every) - 1}")
+    return chosen

@@ -18,6 +18,8 @@ from marl_pack.sapien_check.stack import Floats, Stack, overlaps
 
 GROUND_BIT = 31  # the bit of the collision groups that stands for the floor
 WALL = 0.05  # metres, thickness of the walls
+EVERY = [1 | 1 << GROUND_BIT, 1 | 1 << GROUND_BIT, 0, 0]
+"""Collision words of a box that collides with all other boxes that have them, and the floor."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,14 @@ class World:
         groups: the result of :func:`collision_groups`, if the caller has computed it.
     """
 
+    tgs = True  # whether the solver is TGS; else PGS
+
     def __init__(
         self, stack: Stack, physics: Physics, step: Pass, groups: list[list[int]] | None = None
     ) -> None:
         sapien = self.sapien = load_sapien()
         physx = sapien.physx
-        physx.set_scene_config(enable_tgs=True, enable_pcm=True, enable_ccd=False)
+        physx.set_scene_config(enable_tgs=self.tgs, enable_pcm=True, enable_ccd=False)
         physx.set_body_config(
             solver_position_iterations=step.iterations, solver_velocity_iterations=1,
             sleep_threshold=0.0,
@@ -108,9 +112,12 @@ class World:
         self.material = physx.PhysxMaterial(physics.friction, physics.friction, 0.0)
         self._fix((*stack.size[:2] / 2, -0.5), (*(stack.size[:2] / 2 + 1.0), 0.5))
         if physics.everything:
-            self._add_walls(stack.size)
+            for wall in walls(stack.size):
+                self._fix(*wall)
         groups = collision_groups(stack, physics) if groups is None else groups
-        self.bodies = [self._add_box(stack, i, groups[i]) for i in range(len(stack))]
+        self.bodies: list[Any] = []
+        for i in range(len(stack)):
+            self.add_box(stack, i, groups[i])
 
     def _fix(self, middle: Sequence[float], half: Sequence[float]) -> None:
         """Add a fixed box with which all boxes on the floor collide."""
@@ -128,16 +135,8 @@ class World:
         entity.set_pose(self.sapien.Pose(list(middle)))
         self.scene.add_entity(entity)
 
-    def _add_walls(self, size: Floats) -> None:
-        """Add four walls, as tall as the bin."""
-        for axis in (0, 1):
-            for side in (-WALL / 2, size[axis] + WALL / 2):
-                middle, half = size / 2, size / 2 + WALL
-                middle[axis], half[axis], half[2] = side, WALL / 2, size[2] / 2
-                self._fix(middle.tolist(), half.tolist())
-
-    def _add_box(self, stack: Stack, i: int, groups: list[int]) -> Any:
-        """Add box i of the stack as a moving body, and return the body."""
+    def add_box(self, stack: Stack, i: int, groups: list[int]) -> Any:
+        """Add box i of a stack as a moving body at its nominal pose, and return the body."""
         physx = self.sapien.physx
         body = physx.PhysxRigidDynamicComponent()
         sides, mass = stack.sides[i], float(stack.mass[i])
@@ -151,6 +150,7 @@ class World:
         body.set_linear_damping(0.0)
         body.set_angular_damping(0.0)
         self._add(body, stack.middle[i].tolist())
+        self.bodies.append(body)
         return body
 
     def set_poses(self, middles: Floats, rotations: Floats) -> None:
@@ -184,15 +184,36 @@ class World:
         Raises:
             SimulationError: for the reasons of :meth:`poses`.
         """
-        middles, rotations = self.poses()
-        # The vector part's length is the sine of half the angle: exact for small angles.
-        vector = np.linalg.norm(rotations[:, 1:], axis=1)
-        distance = np.linalg.norm(middles - self.stack.middle, axis=1)
-        return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
+        return movement(*self.poses(), self.stack.middle)
 
     def moved(self) -> tuple[int, ...]:
         """Return the boxes that moved by more than a threshold."""
         return past(*self.movement(), self.physics)
+
+
+def movement(middles: Floats, rotations: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """Return how far boxes are from their nominal poses: their middles in metres, and degrees, [n].
+
+    Args:
+        middles: [n, 3], metres.
+        rotations: quaternions [n, 4], w first; a nominal pose has no rotation.
+        nominal: [n, 3], middles of the nominal poses.
+    """
+    # The vector part's length is the sine of half the angle: exact for small angles.
+    vector = np.linalg.norm(rotations[:, 1:], axis=1)
+    distance = np.linalg.norm(middles - nominal, axis=1)
+    return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
+
+
+def walls(size: Floats) -> list[tuple[list[float], list[float]]]:
+    """Return the middle and the half sides of the four walls of a bin, which are as tall as it."""
+    fixed = []
+    for axis in (0, 1):
+        for side in (-WALL / 2, size[axis] + WALL / 2):
+            middle, half = size / 2, size / 2 + WALL
+            middle[axis], half[axis], half[2] = side, WALL / 2, size[2] / 2
+            fixed.append((middle.tolist(), half.tolist()))
+    return fixed
 
 
 def past(distance: Floats, angle: Floats, physics: Physics, share: float = 1) -> tuple[int, ...]:
@@ -211,8 +232,7 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     """
     n = len(stack)
     if physics.everything:
-        every = 1 | 1 << GROUND_BIT
-        return [[every, every, 0, 0]] * n
+        return [EVERY] * n
     on = stack.rests_on()
     near = 2 * (physics.distance + physics.contact_offset)  # both boxes may come closer
     gap = -overlaps(stack.low, stack.high)
