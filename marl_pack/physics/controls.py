@@ -66,6 +66,11 @@ def cube(edge: float, margin: float) -> Plan:
     return plan_of((0, 0, 0, edge, edge, edge), (edge / 2 - margin, 0, edge, edge, edge, edge))
 
 
+def board(thickness: float, margin: float) -> Plan:
+    """Return a board of 300 mm on a block: about half of it protrudes over the block's edge."""
+    return plan_of((0, 0, 0, 300, 100, 100), (150 - margin, 0, 100, 300, 100, thickness))
+
+
 def heavy_on_light(ratio: float, margin: float) -> Plan:
     """Return the stack in the paper's figure: a box on the protruding end of a light box.
 
@@ -129,6 +134,7 @@ def propped(gap: float, edge: float, margin: float) -> Plan:
 
 FAMILIES: dict[str, Callable[[float], Plan]] = {
     **{f"cube of {edge} mm over an edge": partial(cube, edge) for edge in (30, 60, 100, 200, 300)},
+    **{f"board {t} mm thick over an edge": partial(board, t) for t in (3, 6)},
     **{f"box {r} times heavier on a light one": partial(heavy_on_light, r) for r in (1, 10, 100)},
     "box 1000 times heavier on a light one": partial(heavy_on_light, 1000),
     **{f"harmonic overhang, {n} planks": partial(harmonic, n) for n in (3, 5, 8)},

@@ -41,7 +41,7 @@ from marl_pack.sapien_check.world import (
 SAMPLE = 0.05  # seconds between looks at the boxes
 CREEP = 0.1  # share of a threshold from which on a box may be about to fall
 LONGEST = 0.3  # metres; boxes are scaled so that their longest side is the paper's longest
-THINNEST = 1 / 50  # share of the longest side: in thinner boxes a threshold would be a large part
+THINNEST = 1 / 100  # share of the longest side: in thinner boxes a threshold would be a large part
 WIDEST = 3000.0  # ratio of the longest sides of bin and boxes: beyond, boxes may be over 1 km away
 HEAVY = 100.0  # ratio of masses above which a fall has to happen in Physics.heavy as well
 HEAVIEST = 1e4  # ratio of masses beyond which the solver cannot be trusted
