@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def keys() -> Iterator[str]:
                 yield f"{stream} / {setting} / {trial}"
 
 
+@cache
 def plans_of(stream: str, setting: str) -> list[Plan]:
     """Return the packings of a stream."""
     options = SETTINGS[setting]
