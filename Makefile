@@ -29,8 +29,8 @@ check: test
 
 bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
-	  tests/test_items.py tests/test_packing.py tests/test_stability_rules.py \
-	  tests/test_stability_properties.py
+	  tests/test_exact_game.py tests/test_exact_rules.py tests/test_items.py tests/test_packing.py \
+	  tests/test_stability_rules.py tests/test_stability_properties.py
 
 fuzz: $(STAMP)  ## bad and hard input at random, for MINUTES=20
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
@@ -55,15 +55,16 @@ train: $(STAMP)  ## train for a few minutes, then compare with heuristics
 	fi
 	$(BIN)/python -m marl_pack.evaluate --policy runs/quick dblf random --items rs --seed 1
 
-benchmark: $(STAMP)  ## measure every figure of docs/results.md on speed
+benchmark: $(STAMP)  ## measure every figure on speed in the pages of results
 	$(BIN)/python -m benchmarks.masks
 	$(BIN)/python -m benchmarks.rules
 	$(BIN)/python -m benchmarks.room
 	$(BIN)/python -m benchmarks.game
 	$(BIN)/python -m benchmarks.training
 	$(BIN)/python -m benchmarks.play
+	$(BIN)/python -m benchmarks.exact
 
-results: $(STAMP)  ## make docs/results.md of the figures in results/
+results: $(STAMP)  ## make the pages of results of the figures in results/
 	$(BIN)/python -m experiments.page
 
 docs: $(STAMP)  ## the pages and the API reference as HTML

@@ -59,6 +59,8 @@ RULES = {
 POLICIES = ("max_contact", "linear", "tuned", "dblf", "height_min", "best_fit", "random")
 CELLS = (10, 20, 50)
 """Cells in millimetres of the games on whole cells."""
+BOUND = "volume bound"
+"""The row of a stream that no policy can exceed."""
 HALF = 19 * LENGTH
 """Rows of the list of picks in its first half: 19 windows."""
 
@@ -81,7 +83,7 @@ def read(stream: str, spec: ExactSpec) -> tuple[Goods, list[dict[str, str]]]:
     fits = (sides[:, :2].max(1) <= long) & (sides[:, :2].min(1) <= short)
     rows = [row for row, fit in zip(rows, fits, strict=True) if fit]
     weights = {"weights": [float(row["weight_kg"]) for row in rows]} if stream == "cases" else {}
-    return check_goods(sides[fits], spec, source=FILES[stream], **weights), rows
+    return check_goods(sides[fits], spec, weights, source=FILES[stream]), rows
 
 
 @dataclass(frozen=True)
@@ -267,17 +269,30 @@ def play_cells(stream: str, policy: str, cell: int) -> Rollout:
 def measure(key: str) -> dict[str, Any]:
     """Measure one row, such as ``mix max_contact --rule none`` or ``mix dblf cells of 10 mm``."""
     stream, policy, options = key.split(" ", 2)
+    if f"{policy} {options}" == BOUND:
+        return volume_bound(stream)
     if options.startswith("cells"):
         rollout = play_cells(stream, policy, int(options.split()[2]))
     else:
         rollout = play(stream, policy, options)
     figures = mean_utilization(rollout)
+    figures["interval"] = figures.pop("low"), figures.pop("high")
     return figures | {"ms_each": 1000 * rollout.seconds / max(1, int(rollout.packed.sum()))}
+
+
+def volume_bound(stream: str) -> dict[str, Any]:
+    """Return the mean over episodes of the boxes' volume, at most that of the bin."""
+    spec = spec_of(stream, "--rule none")
+    source, episodes = make_stream(stream, spec)
+    volumes = [source.goods.volumes[source.sequence(e)].sum() for e in range(episodes)]
+    shares = np.array(volumes) / np.prod(np.array(spec.size, np.float64))
+    return {"episodes": episodes, "utilization": float(shares.clip(max=1).mean())}
 
 
 def keys() -> Iterator[str]:
     """Yield the keys of all rows."""
     for stream in BINS:
+        yield f"{stream} {BOUND}"
         for options in RULES.values():
             for policy in POLICIES:
                 yield f"{stream} {policy} {options}"

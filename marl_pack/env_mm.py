@@ -66,6 +66,7 @@ class OptionsMm(TypedDict, total=False):
     """The keyword arguments of :class:`raw_env`; its signature has their defaults."""
 
     items: str | Path | ArrayLike | Goods | Mapping[str, Any] | GoodsStream
+    present: ArrayLike | Plan
     order: str
     length: int | None
     max_moves: int
@@ -99,6 +100,8 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
     Args:
         items: a CSV or JSON file, rows of sides in millimetres, a mapping with attributes, goods or
             a stream (:func:`marl_pack.exact.streams.make_goods_stream`).
+        present: boxes that are in the bin at first: rows x, y, z, w, d, h in millimetres, or a
+            plan.
         order: ``"file"`` or ``"draw"``, the order in which boxes come.
         length: number of boxes in an episode; needed with ``"draw"``.
         max_moves: K, number of moves that an observation lists.
@@ -131,6 +134,7 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self,
         items: Any,
         *,
+        present: Any = (),
         order: str = "file",
         length: int | None = None,
         max_moves: int = 256,
@@ -147,7 +151,8 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self.max_moves = whole_number(max_moves, "max_moves", 1, MOST_MOVES)
         self._spec = ExactSpec().with_options(options)
         self._stream = make_goods_stream(items, self._spec, order=order, length=length)
-        self._game = ExactPacking(1, self._stream, spec=self._spec, auto_reset=False)
+        self._present = present
+        self._game = self._new_game(self._stream)
         self._seed: int | None = None  # seed of the stream; None before the first episode
         self._episode = -1
         self._choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: self.max_moves}
@@ -204,12 +209,12 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
                 stream = make_goods_stream(options["items"], self._spec)
             except ValueError as error:
                 raise ValueError(f'options["items"]: {error}') from None
-            game = ExactPacking(1, stream, spec=self._spec, auto_reset=False)
+            game = self._new_game(stream)
             if not game.alive.any():
                 raise ValueError('options["items"]: the first box may be placed nowhere in the bin')
         else:
             stream = self._stream.seeded(seed)
-            game = ExactPacking(1, stream, spec=self._spec, auto_reset=False)
+            game = self._new_game(stream)
             for _ in range(MOST_SKIPPED):  # an episode may have no legal first box: skip it
                 episode += 1
                 game.reset(episode)
@@ -222,12 +227,17 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self._read_game()
         self.infos = {agent: self._info(agent) for agent in AGENTS}
 
+    def _new_game(self, stream: GoodsStream) -> ExactPacking:
+        return ExactPacking(
+            1, stream, spec=self._spec, present=self._present, auto_reset=False
+        )  # fmt: skip
+
     def _choose(self, orientation: int) -> None:
         self._chosen = orientation
 
     def _place(self, orientation: int, choice: int) -> None:
         moves = self._listed[self._orientations == orientation]
-        outcome = self._game.place(moves[[choice]])
+        outcome = self._game.place(moves[[choice]], check=False)  # step has checked it
         self._read_game()
         self._placed(float(outcome.reward[0]), bool(outcome.done[0]))
 

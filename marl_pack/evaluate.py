@@ -248,8 +248,8 @@ def check_world(arguments: argparse.Namespace) -> None:
             raise ValueError(f"{flag}: goes with --world {'cells' if in_mm else 'mm'}")
     if not in_mm:
         check_names(arguments)
-    elif arguments.symmetric or arguments.device != "cpu":
-        raise ValueError("--world mm: --symmetric and --device go with --world cells")
+    elif arguments.symmetric or arguments.device != "cpu" or arguments.threads != 1:
+        raise ValueError("--world mm: --symmetric, --device and --threads go with --world cells")
 
 
 def choose_setup(arguments: argparse.Namespace, console: Console) -> Setup | SetupMm:

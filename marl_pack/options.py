@@ -23,7 +23,12 @@ COMMON = frozenset(each.name for each in fields(GameSpec)) & {
 """Options that games on cells have, too."""
 ONLY_CELLS = ("sides", "bin", "margin", "mask_orientations", "com_offset", "max_items",
               "orientation", "placement", "plan")  # fmt: skip
-ONLY_MM = (*(each.name for each in fields(ExactSpec) if each.name not in COMMON), "order", "length")
+ONLY_MM = (
+    *(each.name for each in fields(ExactSpec) if each.name not in COMMON),
+    "order",
+    "length",
+    "present",
+)
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
 GAME_NOTE = """\
@@ -76,6 +81,10 @@ def add_mm_options(options: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--order", choices=ORDERS,
         help="file: the sequences of the file (default); draw: boxes drawn at random",
+    )  # fmt: skip
+    group.add_argument(
+        "--present", type=Path, metavar="FILE",
+        help="a plan of one bin (.json or .csv): boxes that are in every bin at first",
     )  # fmt: skip
     group.add_argument(
         "--length", type=int, metavar="N",

@@ -15,10 +15,12 @@ from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.evaluation.rollout import Rollout, batches_mm
 from marl_pack.exact.packing import ExactPacking
 from marl_pack.exact.policies import ExactPolicy, make_exact_policy
+from marl_pack.exact.present import check_present
 from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.exact.streams import GoodsStream, make_goods_stream
 from marl_pack.items.generated import no_such_file
 from marl_pack.option_record import given_options
+from marl_pack.plan import Plan
 from marl_pack.terminal import announce_compiling
 
 
@@ -29,6 +31,7 @@ class SetupMm:
     policies: dict[str, ExactPolicy]  # by the name of the policy's row in the table
     stream: GoodsStream
     spec: ExactSpec
+    present: Plan | tuple[()]  # boxes that are in every bin at first
     arguments: argparse.Namespace  # the parsed options
 
     def batches(
@@ -40,8 +43,9 @@ class SetupMm:
     def game(self, n: int, first_episode: int) -> ExactPacking:
         """Return ``n`` games without ``auto_reset``; the first plays episode ``first_episode``."""
         return ExactPacking(
-            n, self.stream, spec=self.spec, auto_reset=False, first_episode=first_episode
-        )
+            n, self.stream, spec=self.spec, present=self.present, auto_reset=False,
+            first_episode=first_episode,
+        )  # fmt: skip
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -80,4 +84,11 @@ def choose_mm(arguments: argparse.Namespace, console: Console) -> SetupMm:
         name: make_exact_policy(own_policy(name) if is_own(name) else name, seed)
         for name in arguments.policy or ["max_contact"]
     }
-    return SetupMm(policies, stream, spec, arguments)
+    present: Plan | tuple[()] = ()
+    if arguments.present is not None:
+        if not arguments.present.is_file():
+            raise no_such_file(str(arguments.present))
+        read = Plan.from_csv if arguments.present.suffix == ".csv" else Plan.from_json
+        present = read(arguments.present)
+        check_present(present, spec)  # refuses impossible boxes before the games begin
+    return SetupMm(policies, stream, spec, present, arguments)

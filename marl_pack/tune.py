@@ -25,6 +25,7 @@ from marl_pack.option_record import add_arguments, given_options
 from marl_pack.terminal import Parser, announce_compiling, complain, make_console, make_progress
 
 PROGRAM = "python -m marl_pack.tune"
+MOST_MINUTES = 1e6
 MEASURE = 200
 """Episodes on which the result is measured, at most."""
 
@@ -75,8 +76,10 @@ def check_options(arguments: argparse.Namespace) -> None:
     check_writable(arguments.out)
     if not Path(arguments.items).is_file():
         raise no_such_file(arguments.items)
-    if not real_number(arguments.minutes, "--minutes") > 0:
-        raise ValueError(f"--minutes {arguments.minutes:g}: needs a number > 0")
+    if not 0 < real_number(arguments.minutes, "--minutes") <= MOST_MINUTES:
+        raise ValueError(f"--minutes {arguments.minutes:g}: needs a number > 0, at most 1e6")
+    if arguments.start is not None and not arguments.start.is_file():
+        raise FileNotFoundError(f"{arguments.start}: no such file")
     if arguments.generations is not None:
         whole_number(arguments.generations, "--generations", 1)
     whole_number(arguments.games, "--games", 1, 4096)

@@ -81,7 +81,7 @@ def test_a_policy_of_the_users_own(words: list[str], tmp_path: Path) -> None:
     [
         (["--bin", "3", "3", "3"], "--bin: goes with --world cells"),
         (["--margin", "1"], "--margin: goes with --world cells"),
-        (["--device", "cuda"], "--device go with --world cells"),
+        (["--device", "cuda"], "--device and --threads go with --world cells"),
         (["--margin-mm", "-1"], "margin_mm = -1.0: needs a length"),
         (["--clearance-mm", "0.05"], "whole units of 0.1 mm"),
         (["--policy", "dbfl"], "did you mean 'dblf'"),
@@ -121,3 +121,29 @@ def _status(words: list[str]) -> Any:
         return evaluate.main(words)
     except SystemExit as error:
         return error.code
+
+
+def test_boxes_of_a_plan_are_in_every_bin(words: list[str], tmp_path: Path) -> None:
+    from marl_pack.plan import Plan
+
+    plan = Plan.of_boxes((800, 600, 700), [[0, 0, 0, 800, 600, 350]], unit_mm=1)
+    plan.to_json(tmp_path / "there.json")
+    out = tmp_path / "out.json"
+    more = ["--present", str(tmp_path / "there.json"), "--length", "3", "--json", str(out)]
+    assert evaluate.main([*words, *more]) == 0
+    assert json.loads(out.read_text())["policies"]["max_contact"]["utilization"] > 0.5
+    assert _status([*words, "--present", str(tmp_path / "nowhere.json")]) == 2
+    Plan.of_boxes((9, 9, 9), [[0, 0, 3, 9, 9, 3]], unit_mm=1).to_json(tmp_path / "bad.json")
+    assert _status([*words, "--present", str(tmp_path / "bad.json")]) == 2
+
+
+def test_a_policy_that_returns_no_legal_move_is_refused(words: list[str], tmp_path: Path) -> None:
+    code = tmp_path / "wrong.py"
+    code.write_text(
+        "import numpy as np\n"
+        "def seven(game):\n    return np.full(game.n, 7)\n"
+        "def short(game):\n    return np.zeros(1, np.int64)\n"
+        "def nothing(game):\n    return None\n"
+    )
+    for name in ("seven", "short", "nothing"):
+        assert _status([*words, "--length", "3", "--policy", f"{code}:{name}"]) == 2

@@ -16,7 +16,9 @@ from marl_pack.exact.choice import LINEAR, best_of, waste_of
 from marl_pack.exact.features import FEATURES
 from marl_pack.exact.goods import Goods, check_goods
 from marl_pack.exact.lengths import to_mm, to_units
+from marl_pack.exact.moves import encode
 from marl_pack.exact.policies import HEURISTICS, linear_weights
+from marl_pack.exact.present import check_present
 from marl_pack.exact.streams import Draws, Given, make_goods_stream, read_goods
 from marl_pack.plan import Plan
 from marl_pack.stability.static_equilibrium import in_equilibrium
@@ -25,7 +27,7 @@ SMALL = ExactSpec(bin_mm=(60, 50, 90), unit_mm=1, max_boxes=64)
 
 
 def goods(sides: Any, spec: ExactSpec = SMALL, **attributes: Any) -> Goods:
-    return check_goods(np.atleast_2d(sides), spec, **attributes)
+    return check_goods(np.atleast_2d(sides), spec, attributes)
 
 
 def play_random(bins: ExactBins, everything: Goods, rng: np.random.Generator) -> list[int]:
@@ -91,7 +93,7 @@ def test_an_unknown_option_is_refused_with_the_nearest_one() -> None:
     ("sides", "attributes", "message"),
     [
         ([[10, 10]], {}, "needs rows of three numbers"),
-        ([[10, 10, 10], [10, 0, 10]], {}, r"row 1 is \[10, 0, 10\]: zero or negative"),
+        ([[10, 10, 10], [10, 0, 10]], {}, r"row 1 is \[10\.0, 0\.0, 10\.0\]: zero or negative"),
         ([[10, 10, np.nan]], {}, "needs finite numbers"),
         ([[10, 10, 1.5]], {}, "needs whole units of 1 mm; choose a smaller unit"),
         ([[10, 10, 91]], {}, "fits into the bin of 60 x 50 x 90 mm in none"),
@@ -108,7 +110,7 @@ def test_impossible_goods_are_refused_by_their_row(
     sides: Any, attributes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        check_goods(sides, SMALL, **attributes)
+        check_goods(sides, SMALL, attributes)
 
 
 def test_a_box_must_be_higher_than_the_level_tolerance() -> None:
@@ -220,8 +222,8 @@ def test_max_load_and_stackable_are_never_violated() -> None:
 
 def test_a_box_of_unknown_weight_may_not_add_to_a_limited_load() -> None:
     spec = SMALL.with_options({"orientations": (0,)})
-    bins = ExactBins(1, spec)
-    bins.add_present(0, [[0, 0, 0, 60, 50, 20]], goods([[60, 50, 20]], spec, max_load=[5]))
+    present = check_present([[0, 0, 0, 60, 50, 20]], spec, {"max_load": [5]})
+    bins = ExactBins(1, spec, present)
     assert not len(bins.moves(goods([[60, 50, 20]], spec)).numbers)
     for weight, count in ((5, 1), (5.01, 0)):
         assert len(bins.moves(goods([[60, 50, 20]], spec, weights=[weight])).numbers) == count
@@ -229,11 +231,11 @@ def test_a_box_of_unknown_weight_may_not_add_to_a_limited_load() -> None:
 
 def test_the_load_counts_boxes_above_through_every_contact() -> None:
     spec = SMALL.with_options({"orientations": (0,)})
-    bins = ExactBins(1, spec)
     # Two pillars, a plank on both, a box on the plank: each pillar carries both.
     boxes = [(0, 0, 0, 10, 50, 20), (50, 0, 0, 10, 50, 20), (0, 0, 20, 60, 50, 10)]
-    items = goods(np.array(boxes)[:, 3:], spec, weights=[1, 1, 4], max_load=[6, 9, 9])
-    bins.add_present(0, boxes, items)
+    bins = ExactBins(
+        1, spec, check_present(boxes, spec, {"weights": [1, 1, 4], "max_load": [6, 9, 9]})
+    )
     assert bins.state.carried[0, :3].tolist() == [4, 4, 0]
     assert len(bins.moves(goods([[60, 50, 10]], spec, weights=[2])).numbers)
     assert not len(bins.moves(goods([[60, 50, 10]], spec, weights=[2.1])).numbers)
@@ -294,9 +296,11 @@ def test_a_full_bin_says_so() -> None:
 @pytest.mark.parametrize(
     ("boxes", "message"),
     [
-        ([[0, 0, 0, 61, 10, 10]], "fits into the bin|reaches out"),
+        ([[0, 0, 0, 61, 10, 10]], "reaches out"),
         ([[51, 0, 0, 10, 10, 10]], "reaches out of the bin"),
         ([[0, 0, 0, 10, 10, 10], [5, 5, 0, 10, 10, 10]], "overlaps box 0"),
+        ([[0, 0, 0, 10, 10]], "needs rows of six numbers"),
+        ("abc", "needs rows of six numbers"),
         ([[0, 0, 5, 10, 10, 10]], "floats"),
         ([[0, 0, 0.5, 10, 10, 10]], "whole units of 1 mm"),
     ],
@@ -311,8 +315,7 @@ def test_impossible_boxes_in_the_bin_are_refused(boxes: Any, message: str) -> No
 
 def test_moves_are_candidates_at_edges_in_order() -> None:
     spec = SMALL.with_options({"orientations": (0,), "rule": "none"})
-    bins = ExactBins(1, spec)
-    bins.add_present(0, [[0, 0, 0, 20, 10, 30]])
+    bins = ExactBins(1, spec, check_present([[0, 0, 0, 20, 10, 30]], spec))
     rows = placements(bins.moves(goods([[15, 8, 10]], spec)).numbers)
     assert rows[:, 1:].tolist() == sorted(rows[:, 1:].tolist(), key=lambda r: (r[2], r[0], r[1]))
     assert set(rows[:, 1].tolist()) == {0, 5, 20, 45}  # walls, and both edges in both alignments
@@ -324,8 +327,7 @@ def test_moves_are_candidates_at_edges_in_order() -> None:
 def test_a_clearance_adds_candidates_beside_edges_and_keeps_off_walls() -> None:
     options = {"orientations": (0,), "rule": "none", "clearance_mm": 2}
     spec = SMALL.with_options(options)
-    bins = ExactBins(1, spec)
-    bins.add_present(0, [[2, 2, 0, 20, 10, 30]])
+    bins = ExactBins(1, spec, check_present([[2, 2, 0, 20, 10, 30]], spec))
     rows = placements(bins.moves(goods([[15, 8, 10]], spec)).numbers)
     assert set(rows[:, 1].tolist()) == {2, 4, 5, 7, 22, 24, 43}
     for _, x, y, z in rows.tolist():
@@ -393,8 +395,7 @@ def test_a_linear_score_is_the_sum_of_the_features() -> None:
 
 def test_features_by_hand() -> None:
     spec = SMALL.with_options({"orientations": (0,), "rule": "none"})
-    bins = ExactBins(1, spec)
-    bins.add_present(0, [[0, 0, 0, 20, 10, 30]])
+    bins = ExactBins(1, spec, check_present([[0, 0, 0, 20, 10, 30]], spec))
     item = goods([[10, 20, 30]], spec)
     moves = bins.moves(item).numbers
     rows = [tuple(row[1:]) for row in placements(moves).tolist()]
@@ -495,6 +496,36 @@ def test_a_game_that_is_played_needs_a_move() -> None:
         game.place(np.array([NOWHERE]))
 
 
+def test_an_illegal_move_is_refused_and_changes_nothing() -> None:
+    boxes = [[30, 25, 45], [30, 25, 45]]
+    game = ExactPacking(1, boxes, spec=SMALL, orientations=(0,), auto_reset=False)
+    game.place(game.moves.of(0)[:1])
+    before = [array.copy() for array in game.bins.state]
+    legal = int(game.moves.of(0)[-1])
+    unstable = int(encode(0, 16, 0, 45))  # its middle lies beyond the edge of the first box
+    floating, inside, beyond, turned = (
+        int(encode(*move)) for move in ((0, 30, 0, 7), (0, 5, 5, 0), (0, 31, 0, 0), (1, 30, 0, 0))
+    )
+    for wrong in (unstable, floating, inside, beyond, turned, NOWHERE):
+        with pytest.raises(ValueError, match="game 0: needs one of its legal moves"):
+            game.place(np.array([wrong]))
+        assert all((a == b).all() for a, b in zip(before, game.bins.state, strict=True))
+    for wrong in ([1.5], [[legal]], [legal, legal], ["a"]):
+        with pytest.raises(ValueError, match="moves: needs whole numbers"):
+            game.place(wrong)
+    game.place([legal])
+    assert game.bins.state.count[0] == 2
+
+
+def test_weights_that_add_up_to_the_limit_are_not_above_it() -> None:
+    spec = SMALL.with_options({"max_weight_kg": 0.3})
+    bins = ExactBins(1, spec)
+    for weight in (0.1, 0.2):
+        item = goods([[10, 10, 10]], spec, weights=[weight])
+        bins.place(item, bins.moves(item).numbers[:1])
+    assert not len(bins.moves(goods([[10, 10, 10]], spec, weights=[0.001])).numbers)
+
+
 def test_selected_games_are_copies() -> None:
     game = ExactPacking(2, [[10, 10, 10]] * 5, spec=SMALL, auto_reset=False)
     policy = make_exact_policy("max_contact")
@@ -525,19 +556,102 @@ def test_plans_have_ids_orientations_weights_and_whole_lengths() -> None:
     assert isinstance(plan, Plan)
 
 
+def test_an_unknown_weight_above_a_limit_leaves_no_room_for_more() -> None:
+    """A box of unknown weight that is already there may weigh anything."""
+    boxes = [[0, 0, 0, 400, 300, 500], [0, 0, 500, 400, 300, 500]]
+    item = {"items": [[100, 100, 100]], "weights": [4]}
+    for max_load, count in (([5, 1000], 0), ([1e9, 1000], 0)):
+        rows = stable_place(item, boxes, attributes={"max_load": max_load}, at=(0, 0))
+        assert len(rows) == count
+    known = {"max_load": [6, 1000], "weights": [9, 2]}
+    assert len(stable_place(item, boxes, attributes=known, at=(0, 0))) == 1
+
+
+def test_present_boxes_are_in_every_bin_and_come_back_in_the_next_episode() -> None:
+    present = [[0, 0, 0, 60, 50, 40]]
+    game = ExactPacking(2, [[60, 50, 25]] * 3, spec=SMALL, present=present, orientations=(0,))
+    for episode in range(3):
+        assert game.bins.utilization.tolist() == [40 / 90] * 2
+        outcome = game.place([game.moves.of(g)[0] for g in range(2)])
+        assert outcome.packed.tolist() == [2, 2]
+        assert not outcome.done.any()
+        outcome = game.place([game.moves.of(g)[0] for g in range(2)])
+        assert outcome.done.all()
+        assert outcome.utilization.tolist() == [1, 1]
+        assert game.episode.tolist() == [2 * episode + 2, 2 * episode + 3]
+    plan = ExactPacking(1, [[60, 50, 25]], spec=SMALL, present=present).plan(0)
+    again = ExactPacking(1, [[60, 50, 25]], spec=SMALL, present=plan, auto_reset=False)
+    assert again.plan(0) == plan
+    with pytest.raises(ValueError, match="needs a plan of one bin with unit_mm"):
+        ExactPacking(1, [[60, 50, 25]], spec=SMALL, present=Plan.of_boxes((9, 9, 9), present[:0]))
+
+
+def test_present_boxes_may_touch_walls_within_the_clearance() -> None:
+    spec = SMALL.with_options({"clearance_mm": 5})
+    check_present([[0, 0, 0, 60, 50, 20]], spec)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"item": None}, "item: needs rows of three numbers"),
+        ({"item": [True, True, True]}, "item: needs rows of three numbers"),
+        ({"item": ["600", "300", "100"]}, "item: needs rows of three numbers"),
+        ({"item": [[600], [300], [100]]}, "item: needs rows of three numbers"),
+        ({"item": [10, 10, 10], "boxes": [[0, 0, 0], [400, 300, 500]]}, "rows of six numbers"),
+        ({"item": [10, 10, 10], "at": ("99", "0")}, "at: needs rows of two numbers"),
+        ({"item": [10, 10, 10], "at": 5}, "at: needs rows of two numbers"),
+        ({"item": [10, 10, 10], "attributes": [1]}, "need a mapping"),
+        ({"item": [10, 10, 10], "attributes": {"colour": [1]}}, "unknown attribute 'colour'"),
+        ({"item": [10, 10, 10], "boxes": [[0, 0, 0, 9, 9, 9]], "attributes": {"quantity": [2]}},
+         "'quantity' has no meaning"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_of_stable_place_are_refused(
+    arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        stable_place(**arguments)
+
+
+def test_orientations_of_the_same_box_count_once_at_a_corner() -> None:
+    assert len(stable_place([100, 100, 100], at=(0, 0))) == 1
+    assert len(stable_place([100, 100, 200], at=(0, 0))) == 3
+
+
+@pytest.mark.parametrize("items", [None, 5, {1, 2, 3}, "abc", (x for x in ([1, 2, 3],))])
+def test_things_that_are_not_items_are_refused(items: Any) -> None:
+    with pytest.raises((ValueError, OSError), match=r"items|abc|ending"):
+        ExactPacking(1, items)
+
+
+def test_goods_belong_to_the_unit_of_their_game() -> None:
+    with pytest.raises(ValueError, match=r"units of 1 mm; needs the game's unit_mm, 0\.1"):
+        ExactPacking(1, check_goods([[600, 400, 300]], ExactSpec(unit_mm=1)))
+    bins = ExactBins(4, SMALL)
+    with pytest.raises(ValueError, match="needs one for each of 4 bins"):
+        bins.moves(goods([[10, 10, 10]]))
+
+
+def test_an_episode_ends_when_the_bin_holds_max_boxes() -> None:
+    game = ExactPacking(1, [[10, 10, 10]] * 5, spec=SMALL, max_boxes=3, auto_reset=False)
+    done = [bool(game.place(game.moves.of(0)[:1]).done[0]) for _ in range(3)]
+    assert done == [False, False, True]
+    assert len(game.plan(0)) == 3
+
+
 def test_more_parts_than_there_was_memory_for() -> None:
     """Carrying parts grow: many small boxes below one large box."""
     spec = ExactSpec(bin_mm=(100, 100, 40), unit_mm=1, rule="hull_alpha", max_boxes=128)
-    bins = ExactBins(2, spec)
     small = [[x, y, 0, 9, 9, 10] for x in range(0, 100, 10) for y in range(0, 100, 10)]
-    bins.add_present(0, small)
+    bins = ExactBins(2, spec, check_present(small, spec))
     before = bins.state.parts.shape[1]
     for k in range(9):
         plank = goods([[100, 100, 1]], spec)
         index = np.zeros(2, np.int64)
         moves = bins.moves(plank[index], np.array([True, False]))
         bins.place(plank[index], np.array([moves.of(0)[0], NOWHERE]))
-        assert bins.state.count.tolist() == [101 + k, 0]
+        assert bins.state.count.tolist() == [101 + k, 100]
     assert bins.state.parts.shape[1] > before
 
 

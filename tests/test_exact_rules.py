@@ -16,7 +16,7 @@ from marl_pack.exact import reference
 from marl_pack.exact.bins import ExactBins, placements
 from marl_pack.exact.goods import Goods, check_goods
 from marl_pack.exact.limits import SCALE
-from marl_pack.exact.polygons import clip, convex_hull, deeper
+from marl_pack.exact.polygons import clip, convex_hull, deeper, has_area
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.stability.static_equilibrium import in_equilibrium
 
@@ -27,7 +27,7 @@ ALWAYS = np.ones(1, np.bool_)
 
 
 def goods(sides: Any, spec: ExactSpec, **attributes: Any) -> Goods:
-    return check_goods(np.atleast_2d(sides), spec, **attributes)
+    return check_goods(np.atleast_2d(sides), spec, attributes)
 
 
 def bins_with(boxes: Any, spec: ExactSpec, **attributes: Any) -> ExactBins:
@@ -174,6 +174,7 @@ def test_a_clipped_polygon_lies_inside_the_exact_one_and_loses_less_than_a_latti
             assert x0 <= p[0] <= x1
             assert y0 <= p[1] <= y1
             assert all(reference.cross(a, b, p) >= 0 for a, b in reference.edges(polygon))
+        assert has_area(out, 0, n) or not exact or _thin(exact)
         for p in exact:  # each exact corner has a rounded one beside it, if it is not a sliver
             near = np.abs(out[:n] - np.array([float(c) for c in p])).max(1) if n else np.array([9])
             assert near.min() < 1 or len(exact) < 3 or _thin(exact)
@@ -341,6 +342,39 @@ def test_on_whole_cells_both_worlds_agree(rule: str) -> None:
             legal += int(mask[g].sum())
     assert legal > 100
     assert rule != "lbcp" or STATES < 300 or more
+
+
+def test_a_polygon_of_four_corners_that_is_no_rectangle_is_not_the_whole_top() -> None:
+    """Each box stands, and the last one tips the one below it."""
+    boxes = [(0, 0, 0, 40, 100, 10), (90, 90, 0, 10, 10, 10), (0, 0, 10, 100, 100, 1),
+             (0, 0, 11, 80, 60, 1)]  # fmt: skip
+    last = (60, 0, 12, 20, 20, 380)
+    assert not in_equilibrium([*map(list, boxes), list(last)])
+    spec = ExactSpec(bin_mm=(100, 100, 400), unit_mm=1, rule="lbcp", orientations=(0,))
+    bins = bins_with(boxes, spec)
+    assert not len(bins.moves_at(0, goods(last[3:], spec), np.array([last[:2]])))
+    assert not reference.stable("lbcp", boxes, last)
+
+
+@pytest.mark.parametrize("rule", CHAIN[:3])
+def test_stacks_of_round_sizes_stand(rule: str) -> None:
+    """Round sizes meet at corners, where polygons have few corners."""
+    rng = np.random.default_rng(11)
+    spec = ExactSpec(bin_mm=(10, 10, 60), unit_mm=1, rule=rule, max_boxes=32)
+    for _ in range(STATES // 5):
+        bins = ExactBins(1, spec)
+        for _ in range(14):
+            sides = rng.integers(1, 11, 3)
+            item = goods(sides, spec)
+            moves = bins.moves(item).numbers
+            if len(moves):
+                bins.place(item, rng.choice(moves, 1))
+        boxes = bins.boxes(0)
+        assert in_equilibrium(boxes)
+        if rule != "equilibrium":  # these rules are sound for any weights
+            weights = 10.0 ** rng.integers(-2, 3, len(boxes))
+            centres = boxes[:, :2] + boxes[:, 3:5] / 2
+            assert in_equilibrium(boxes, np.column_stack((weights, centres)))
 
 
 def test_cells_round_load_bearing_polygons_inward() -> None:

@@ -69,8 +69,13 @@ def test_the_network_gives_legal_actions_alone_for_any_bin(size: tuple[int, int,
             env.step(int(logits.argmax()))
 
 
-def test_an_example_in_cleanrls_style_passes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("CleanRL's style", "marl_pack", example("cleanrl_ppo").train, SMALL) == 0
+@pytest.mark.parametrize("world", ["cells", "mm"])
+def test_an_example_in_cleanrls_style_passes(
+    capsys: pytest.CaptureFixture[str], world: str
+) -> None:
+    words = [*SMALL, "--world", world]
+    train = example("cleanrl_ppo").train
+    assert run("CleanRL's style", "marl_pack", train, words, worlds=("cells", "mm")) == 0
     assert capsys.readouterr().out.strip().endswith("passes")
 
 

@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.exact import balance, choice
 from marl_pack.exact.features import FEATURES
-from marl_pack.exact.goods import AXES, Goods, goods_of
-from marl_pack.exact.lengths import to_mm, to_units
+from marl_pack.exact.goods import AXES, Goods
+from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.limits import EQUILIBRIUM, Limits
-from marl_pack.exact.moves import BITS, MASK, list_moves, moves_at
-from marl_pack.exact.rules import OPEN, YES
+from marl_pack.exact.moves import BITS, MASK, decode, list_moves, moves_at
+from marl_pack.exact.present import Present
+from marl_pack.exact.rules import NO, OPEN, YES
 from marl_pack.exact.spec import ExactSpec
-from marl_pack.exact.state import State, add_box, blocked_boxes, empty_state, keeps_parts
+from marl_pack.exact.state import ROUNDING, State, add_box, blocked_boxes, empty_state, keeps_parts
 from marl_pack.installation import njit
 from marl_pack.plan import Plan
 from marl_pack.sapien_check.stack import DENSITY
@@ -120,6 +121,31 @@ def _place_all(
 
 
 @njit(cache=True, nogil=True)
+def _check_all(
+    limits: Limits, size: Any, state: State, items: Any, allowed: Any, weights: Any, known: Any,
+    moves: Any,
+) -> Any:  # fmt: skip
+    """Return the verdict on the move in each bin, uint8 [B]; YES for NOWHERE."""
+    blocked = np.zeros(state.boxes.shape[1], np.bool_)
+    verdicts = np.full(moves.size, YES, np.uint8)
+    corner, out, answer = np.empty((1, 2), np.int64), np.empty(6, np.int64), np.empty(6, np.uint8)
+    for b in range(moves.size):
+        if moves[b] < 0:
+            continue
+        blocked_boxes(state, b, weights[b], known[b], blocked)
+        _, corner[0, 0], corner[0, 1], _ = decode(moves[b])
+        total = moves_at(
+            limits, size, state.boxes[b], state.count[b], state.starts[b], state.parts[b], blocked,
+            items[b], allowed[b], corner, out, answer,
+        )  # fmt: skip
+        verdicts[b] = NO
+        for m in range(total):
+            if out[m] == moves[b]:
+                verdicts[b] = answer[m]
+    return verdicts
+
+
+@njit(cache=True, nogil=True)
 def _waste_all(state: State, items: Any, moves: Any) -> Any:
     """Return the space that a placement encloses in each bin, float64 [B]; 0 for NOWHERE."""
     waste = np.zeros(moves.size)
@@ -141,12 +167,19 @@ class ExactBins:
     Args:
         n: number of bins B.
         spec: options of the game.
+        present: boxes that are in every bin at first
+            (:func:`marl_pack.exact.present.check_present`).
     """
 
-    def __init__(self, n: int, spec: ExactSpec) -> None:
+    def __init__(self, n: int, spec: ExactSpec, present: Present | None = None) -> None:
         self.spec, self.limits = spec, spec.limits()
         self.size = np.array(spec.size, np.int64)
-        self.state = empty_state(n, spec.max_boxes, keeps_parts(self.limits.rule))
+        self.state = empty_state(1, spec.max_boxes, keeps_parts(self.limits.rule))
+        if present is not None:
+            for k in range(len(present.rows)):
+                self._add(present.rows[[k]], present.goods[[k]], np.ones(1, np.bool_))
+        self._first = self.state
+        self.state = self.state.at(np.zeros(n, np.int64))
 
     def __len__(self) -> int:
         return len(self.state.count)
@@ -169,17 +202,20 @@ class ExactBins:
 
     def select(self, index: Any) -> ExactBins:
         """Return copies of the bins ``index``: whole numbers, a slice or bool [B]."""
+        index = np.atleast_1d(np.arange(len(self))[index])
         other = object.__new__(ExactBins)
         other.spec, other.limits, other.size = self.spec, self.limits, self.size
-        other.state = self.state.at(index)
+        other._first, other.state = self._first, self.state.at(index)
         return other
 
     def clear(self, chosen: NDArray[np.bool_]) -> None:
-        """Empty the chosen bins, bool [B]."""
-        fresh = empty_state(1, self.spec.max_boxes, False)
+        """Take all boxes out of the chosen bins, bool [B], except those there at first."""
         for name, array in self.state._asdict().items():
-            if name != "parts":
-                array[chosen] = getattr(fresh, name)[0]
+            first = getattr(self._first, name)[0]
+            if name == "parts":
+                array[chosen, : len(first)] = first  # the bins may have got more rows
+            else:
+                array[chosen] = first
 
     def moves(self, items: Goods, chosen: NDArray[np.bool_] | None = None) -> ListedMoves:
         """List where an item may be placed in each bin.
@@ -204,7 +240,10 @@ class ExactBins:
             out, verdicts = np.resize(out, bigger), np.resize(verdicts, bigger)
         listed = ListedMoves(out[: starts[-1]].copy(), starts)
         unsure = np.flatnonzero(verdicts[: starts[-1]] == OPEN)
-        return self._settle(listed, unsure, items, weights) if len(unsure) else listed
+        if len(unsure):
+            listed = self._settle(listed, unsure, items, weights)
+        listed.numbers.setflags(write=False)
+        return listed
 
     def moves_at(self, b: int, items: Goods, corners: NDArray[np.int64]) -> NDArray[np.int64]:
         """List where an item may be placed in bin ``b`` at given corners, int64 [M].
@@ -232,6 +271,26 @@ class ExactBins:
                 self.limits, state, b, items.sides[b], float(weights[b]), move
             )
         ], np.int64)  # fmt: skip
+
+    def legal(self, items: Goods, moves: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return in which bins an item may be placed by a move, bool [B]; true for NOWHERE.
+
+        Args:
+            items: one row for each bin.
+            moves: int64 [B].
+        """
+        weights, known = self._weights(items)
+        chosen = moves >= 0
+        verdicts = _check_all(
+            self.limits, self.size, self.state, items.sides, items.orientations, weights, known,
+            moves,
+        )  # fmt: skip
+        legal = (verdicts != NO) & (self._open(weights, known, chosen) | ~chosen)
+        for b in np.flatnonzero(verdicts == OPEN).tolist():
+            legal[b] &= balance.in_balance(
+                self.limits, self.state, b, items.sides[b], float(weights[b]), int(moves[b])
+            )
+        return legal
 
     def _settle(
         self, listed: ListedMoves, unsure: NDArray[np.intp], items: Goods, weights: Any
@@ -301,13 +360,10 @@ class ExactBins:
         self._refuse_full(chosen)
         if self.spec.max_weight_kg is None:
             return chosen
-        unknown = (~self.state.known & (self._number < self.state.count[:, None])).any(1)
-        heavy = self.weight + weights > self.spec.max_weight_kg
+        placed = np.arange(self.spec.max_boxes) < self.state.count[:, None]
+        unknown = (~self.state.known & placed).any(1)
+        heavy = self.weight + weights > self.spec.max_weight_kg * (1 + ROUNDING)
         return chosen & known & ~heavy & ~unknown
-
-    @property
-    def _number(self) -> NDArray[np.int64]:
-        return np.arange(self.spec.max_boxes)
 
     def any_move(self, items: Goods, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return in which of the chosen bins an item has a move, bool [B].
@@ -343,13 +399,22 @@ class ExactBins:
             items: one row for each bin.
             moves: int64 [B]; NOWHERE: no placement, no waste.
         """
+        self._weights(items)  # checks the items
         return _waste_all(self.state, items.sides, moves)
 
     def _weights(self, items: Goods) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return the items' weights, assumed from their volume where unknown, and which are known.
 
         Unknown weights are those of boxes of :data:`marl_pack.sapien_check.stack.DENSITY`.
+
+        Raises:
+            ValueError: unless there is an item in the unit of the game for each bin.
         """
+        if len(items) != len(self) or items.unit_mm != self.spec.unit_mm:
+            raise ValueError(
+                f"items: {len(items)} in units of {items.unit_mm:g} mm; needs one for each of "
+                f"{len(self)} bins, in units of {self.spec.unit_mm:g} mm"
+            )
         known = ~np.isnan(items.weights)
         metre = self.spec.unit_mm / 1000
         return np.where(known, items.weights, items.volumes * metre**3 * DENSITY), known
@@ -357,7 +422,8 @@ class ExactBins:
     def place(self, items: Goods, moves: NDArray[np.int64]) -> None:
         """Place an item in each bin where its move is not NOWHERE.
 
-        The moves have to be moves that :meth:`moves` or :meth:`best` returned for these items.
+        The moves have to be moves that :meth:`moves` or :meth:`best` returned for these items, or
+        that :meth:`legal` allows. They are not checked.
 
         Args:
             items: one row for each bin.
@@ -366,6 +432,7 @@ class ExactBins:
         Raises:
             ValueError: if a bin already holds ``max_boxes`` boxes.
         """
+        self._weights(items)  # checks the items
         chosen = moves >= 0
         rows = np.zeros((len(self), 6), np.int64)
         where = placements(np.maximum(moves, 0))
@@ -399,41 +466,6 @@ class ExactBins:
                 "needs a larger max_boxes"
             )
 
-    def add_present(self, b: int, boxes_mm: ArrayLike, goods: Goods | None = None) -> None:
-        """Add boxes that are already in bin ``b``, without asking the rule.
-
-        Args:
-            b: number of the bin.
-            boxes_mm: numbers [k, 6], rows x, y, z, w, d, h in millimetres, as placed.
-            goods: their weights and limits, one row for each box; by default unknown weights and no
-                limits.
-
-        Raises:
-            ValueError: if a box reaches out of the bin, overlaps another one or floats; the message
-                names it.
-        """
-        rows, wrong = to_units(np.asarray(boxes_mm, np.float64).reshape(-1, 6), self.spec.unit_mm)
-        if wrong.any() or (rows[:, 3:] <= 0).any() or (rows[:, :3] < 0).any():
-            i = int((wrong.any(1) | (rows[:, 3:] <= 0).any(1) | (rows[:, :3] < 0).any(1)).argmax())
-            raise ValueError(
-                f"box {i} already there: needs x y z ≥ 0 and w d h > 0 in whole units of "
-                f"{self.spec.unit_mm:g} mm"
-            )
-        order = np.argsort(rows[:, 2], kind="stable")
-        count = int(self.state.count[b])
-        stack = [*self.state.boxes[b, :count].astype(np.int64)]
-        for i in order.tolist():
-            _check_box(rows[i], stack, self.size, self.limits.tolerance, f"box {i} already there")
-            stack.append(rows[i])
-        if goods is None:
-            goods = goods_of(
-                to_mm(rows[:, 3:], self.spec.unit_mm), self.spec, "boxes already there"
-            )
-        chosen = np.arange(len(self)) == b
-        for i in order.tolist():
-            index = np.full(len(self), i)
-            self._add(rows[index], goods[index], chosen)
-
     def boxes(self, b: int) -> NDArray[np.int64]:
         """Return the boxes of bin ``b`` in units, int64 [count, 6], rows x, y, z, w, d, h."""
         return self.state.boxes[b, : self.state.count[b]].astype(np.int64)
@@ -463,24 +495,3 @@ class ExactBins:
         return Plan.of_boxes(
             size.tolist(), boxes, loads, ids=ids, orientations=orientations, unit_mm=unit
         )  # fmt: skip
-
-
-def _check_box(
-    box: NDArray[np.int64], stack: Sequence[Any], size: NDArray[np.int64], tolerance: int, name: str
-) -> None:
-    """Refuse a box that reaches out of the bin, overlaps a box of the stack or floats."""
-    low, high = box[:3], box[:3] + box[3:]
-    if (high > size).any():
-        raise ValueError(f"{name} {box.tolist()} reaches out of the bin {size.tolist()} (units)")
-    supported = low[2] == 0
-    for k, other in enumerate(stack):
-        other_low, other_high = other[:3], other[:3] + other[3:]
-        shares = np.minimum(high, other_high) - np.maximum(low, other_low)
-        if (shares > 0).all():
-            raise ValueError(f"{name} {box.tolist()} overlaps box {k} {other.tolist()} (units)")
-        rests = 0 <= low[2] - other_high[2] <= tolerance
-        supported |= bool((shares[:2] > 0).all() and rests)
-    if not supported:
-        raise ValueError(
-            f"{name} {box.tolist()} floats: it rests neither on the floor nor on a box (units)"
-        )

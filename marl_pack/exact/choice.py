@@ -42,14 +42,14 @@ ROUNDING = 1e-9
 
 
 @njit(cache=True)
-def most_of_the_rest(weights: Any, waste_too: bool) -> float:
+def most_of_the_rest(weights: Any) -> float:
     """Return the most that features of faces and gaps, and of waste, can add to a linear score.
 
     The shares of the surface add up to at most 1; every other feature is from 0 to 1.
     """
     most = max(0.0, weights[BOTTOM], weights[SIDES], weights[WALLS])
     most += max(0.0, weights[LEVEL]) + max(0.0, weights[GAP_X]) + max(0.0, weights[GAP_Y])
-    return most + (max(0.0, weights[WASTE]) if waste_too else 0.0)
+    return most + max(0.0, weights[WASTE])
 
 
 @njit(cache=True)
@@ -65,7 +65,7 @@ def linear_score(
     known = weights[REST] * features[REST] + weights[TOP] * features[TOP]
     known += weights[ALONG_X] * features[ALONG_X] + weights[ALONG_Y] * features[ALONG_Y]
     known += weights[FOOTPRINT] * features[FOOTPRINT] + weights[HEIGHT] * features[HEIGHT]
-    if known + most_of_the_rest(weights, True) < needed - ROUNDING:
+    if known + most_of_the_rest(weights) < needed - ROUNDING:
         return -np.inf
     describe_contacts(limits, size, boxes, n, item, move, features)
     features[WASTE] = 0.0

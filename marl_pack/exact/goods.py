@@ -9,13 +9,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.checks import number_in, real_number, shown
-from marl_pack.exact.lengths import to_units
+from marl_pack.checks import decimals, number_in, real_number, shown
+from marl_pack.exact.lengths import to_mm, to_units
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.geometry import ALL_ORIENTATIONS, ORIENTATIONS
 from marl_pack.items.attributes import ATTRIBUTES, TRUTH, UPRIGHT, Attribute
 from marl_pack.items.names import check_names
 
+NUMBERS = {2: "two", 3: "three", 6: "six"}
 MOST_ROWS = 10_000_000
 """The largest number of boxes that goods may have, quantities counted."""
 
@@ -52,13 +53,16 @@ class Goods:
     stackable: NDArray[np.bool_]  # [R]           whether anything may rest on it
     max_load: NDArray[np.float64]  # [R]          largest weight above it, kilograms
     ids: NDArray[np.object_]  # [R]               its id, a text; "" where there is none
+    unit_mm: float  # millimetres of one unit
 
     def __len__(self) -> int:
         return len(self.sides)
 
     def __getitem__(self, index: Any) -> Self:
         """Return the chosen rows."""
-        return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        unit = columns.pop("unit_mm")
+        return type(self)(**{name: column[index] for name, column in columns.items()}, unit_mm=unit)
 
     @property
     def volumes(self) -> NDArray[np.float64]:
@@ -67,28 +71,30 @@ class Goods:
 
 
 def check_goods(
-    sides_mm: ArrayLike, spec: ExactSpec, *, source: str = "items", **attributes: Any
+    sides_mm: ArrayLike,
+    spec: ExactSpec,
+    attributes: Mapping[str, Any] | None = None,
+    *,
+    source: str = "items",
+    fit: bool = True,
 ) -> Goods:
     """Check goods and return them in units; a row with a quantity is repeated.
 
     Args:
         sides_mm: numbers [R, 3], own sides w, d, h in millimetres.
-        spec: the game: goods need to fit into its bin and its unit.
-        source: name of the goods in messages.
+        spec: the game, with its unit.
         attributes: values of :data:`GOODS_ATTRIBUTES` by key, one for each row: ``weights``
             (kilograms), ``upright``, ``orientations``, ``ids``, ``quantity``, ``stackable``,
             ``max_load`` (kilograms).
+        source: name of the goods in messages.
+        fit: whether each box has to fit into the bin.
 
     Raises:
         ValueError: naming the row, and what would be right.
     """
+    attributes = attributes or {}
     check_names(attributes, KEYS, (), source, "attribute")
-    try:
-        rows = np.asarray(sides_mm)
-    except ValueError:  # rows of different lengths
-        rows = np.empty(0, object)
-    if rows.dtype.kind not in "iuf" or rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):
-        raise ValueError(f"{source}: needs rows of three numbers, w d h in mm")
+    rows = number_rows(sides_mm, 3, source, "w d h in mm")
     values = {
         attribute.key: _column(attribute, attributes[attribute.key], rows, source)
         for attribute in GOODS_ATTRIBUTES
@@ -101,10 +107,62 @@ def check_goods(
         inexact.any(1), rows, source,
         f"needs whole units of {spec.unit_mm:g} mm; choose a smaller unit (unit_mm)",
     )  # fmt: skip
-    allowed = _allowed(values.get("orientations"), values.get("upright"), rows, source)
-    allowed &= np.isin(ALL_ORIENTATIONS, spec.orientations)
+    count = len(rows)
+    goods = Goods(
+        sides=units,
+        weights=values.get("weights", np.full(count, np.nan)),
+        orientations=_allowed(values.get("orientations"), values.get("upright"), rows, source),
+        stackable=values.get("stackable", np.ones(count, np.bool_)),
+        max_load=values.get("max_load", np.full(count, np.inf)),
+        ids=np.array([str(name) for name in values.get("ids", [""] * count)], object),
+        unit_mm=spec.unit_mm,
+    )
+    if fit:
+        goods = _fitting(goods, spec, rows, source)
+    quantity = values.get("quantity")
+    if quantity is None:
+        return goods
+    if quantity.sum(dtype=np.float64) > MOST_ROWS:
+        raise ValueError(f"{source}: {quantity.sum()} boxes: needs at most {MOST_ROWS}")
+    return goods[np.arange(count).repeat(quantity)]
+
+
+def number_rows(values: Any, width: int, source: str, what: str) -> NDArray[np.float64]:
+    """Return rows of numbers, float64 [R, width]; an empty list has no rows.
+
+    Raises:
+        ValueError: for anything else, such as texts, truth values or rows of other lengths.
+    """
+    try:
+        rows = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        rows = np.empty(0, object)
+    if (
+        rows.size == 0
+        and rows.ndim <= 2
+        and rows.dtype.kind == "f"
+        and isinstance(values, Sequence)
+    ):
+        return np.empty((0, width))
+    if rows.dtype.kind not in "iuf" or rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{source}: needs rows of {NUMBERS[width]} numbers, {what}")
+    return decimals(rows)
+
+
+def _fitting(goods: Goods, spec: ExactSpec, rows: NDArray[Any], source: str) -> Goods:
+    """Return goods with the orientations that the game allows; refuse those that cannot be placed.
+
+    Args:
+        goods: the goods.
+        spec: the game.
+        rows: the sides that messages show, [R, 3].
+        source: name of the goods in messages.
+    """
+    if not len(goods):
+        raise ValueError(f"{source}: needs at least one row of three numbers, w d h in mm")
+    allowed = goods.orientations & np.isin(ALL_ORIENTATIONS, spec.orientations)
     _refuse(~allowed.any(1), rows, source, f"may not take an orientation of {spec.orientations}")
-    placed = units[:, AXES]  # [R, 6, 3]
+    placed = goods.sides[:, AXES]  # [R, 6, 3]
     fits = allowed & (placed <= _room(spec)).all(2)
     _refuse(
         ~fits.any(1), rows, source,
@@ -116,21 +174,7 @@ def check_goods(
         thin & (spec.level_tolerance_mm > 0), rows, source,
         f"lower than level_tolerance_mm = {spec.level_tolerance_mm:g}; needs a smaller tolerance",
     )  # fmt: skip
-    count = len(rows)
-    goods = Goods(
-        sides=units,
-        weights=values.get("weights", np.full(count, np.nan)),
-        orientations=allowed,
-        stackable=values.get("stackable", np.ones(count, np.bool_)),
-        max_load=values.get("max_load", np.full(count, np.inf)),
-        ids=np.array([str(name) for name in values.get("ids", [""] * count)], object),
-    )
-    quantity = values.get("quantity")
-    if quantity is None:
-        return goods
-    if quantity.sum(dtype=np.float64) > MOST_ROWS:
-        raise ValueError(f"{source}: {quantity.sum()} boxes: needs at most {MOST_ROWS}")
-    return goods[np.arange(count).repeat(quantity)]
+    return replace(goods, orientations=allowed)
 
 
 def _room(spec: ExactSpec) -> NDArray[np.int64]:
@@ -183,11 +227,20 @@ def _refuse(wrong: Any, rows: NDArray[Any], source: str, why: str) -> None:
 
 
 def goods_of(items: Any, spec: ExactSpec, source: str = "items") -> Goods:
-    """Return goods from rows of sides in millimetres, a mapping with attributes, or goods."""
+    """Return goods from rows of sides in millimetres, a mapping with attributes, or goods.
+
+    Raises:
+        ValueError: for impossible goods, or goods in another unit than that of the game.
+    """
     if isinstance(items, Goods):
-        return items
+        if items.unit_mm != spec.unit_mm:
+            raise ValueError(
+                f"{source}: goods in units of {items.unit_mm:g} mm; needs the game's unit_mm, "
+                f"{spec.unit_mm:g}"
+            )
+        return _fitting(items, spec, to_mm(items.sides, spec.unit_mm), source)
     if isinstance(items, Mapping):
         check_names(items, ("items", *KEYS), ("items",), source, "key")
         rest = {key: value for key, value in items.items() if key != "items"}
-        return check_goods(items["items"], spec, source=source, **rest)
+        return check_goods(items["items"], spec, rest, source=source)
     return check_goods(items, spec, source=source)

@@ -1,7 +1,7 @@
 """The packing game in millimetres: G games at once, each with one bin and its own conveyor.
 
 A box is visible; it is placed by one of its listed moves; then the next box comes. An episode ends
-when the visible box has no move, or when its sequence ends.
+when the visible box has no move, when its sequence ends, or when the bin holds ``max_boxes``.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
+from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.exact.bins import NOWHERE, ExactBins, ListedMoves, placements
 from marl_pack.exact.goods import AXES, Goods
+from marl_pack.exact.present import check_present
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.streams import GoodsStream, make_goods_stream
 from marl_pack.option_record import document
@@ -23,6 +24,8 @@ from marl_pack.plan import Plan
 
 MOST_GAMES = 1 << 16
 """The largest number of games that can be played at once."""
+LAST_EPISODE = 1 << 62
+"""The largest number that the first episode can have."""
 MOST_SKIPPED = 1000
 """Number of episodes in a row whose first box has no move, after which a game gives up."""
 
@@ -54,6 +57,8 @@ class ExactPacking:
         items: a CSV or JSON file, rows of sides in millimetres, a mapping with attributes, goods or
             a stream (:func:`marl_pack.exact.streams.make_goods_stream`).
         spec: options of the game; by default ``ExactSpec()``.
+        present: boxes that are in every bin at first: rows x, y, z, w, d, h in millimetres, or a
+            plan of one bin (:func:`marl_pack.exact.present.check_present`).
         order: ``"file"`` or ``"draw"``, the order in which the boxes come.
         length: number of boxes in an episode.
         auto_reset: begin a new episode in a game as soon as its episode ends. Episodes whose first
@@ -73,6 +78,7 @@ class ExactPacking:
         items: Any,
         *,
         spec: ExactSpec | None = None,
+        present: Any = (),
         order: str = "file",
         length: int | None = None,
         auto_reset: bool = True,
@@ -89,7 +95,7 @@ class ExactPacking:
         self.stream: GoodsStream = make_goods_stream(
             items, self.spec, order=order, length=length, seed=seed
         )
-        self.bins = ExactBins(self.n, self.spec)
+        self.bins = ExactBins(self.n, self.spec, check_present(present, self.spec))
         self.reset(first_episode)
 
     def reset(self, first_episode: int = 0) -> None:
@@ -98,7 +104,7 @@ class ExactPacking:
         Raises:
             ValueError: for an impossible episode, or if all episodes are skipped.
         """
-        first = whole_number(first_episode, "first_episode", 0, LARGEST_SEED)
+        first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE)
         everything = np.ones(self.n, np.bool_)
         self.bins.clear(everything)
         self.episode = first + np.arange(self.n)
@@ -132,19 +138,27 @@ class ExactPacking:
         self._row = self.visible
         self.items: Goods = self.stream.goods[np.maximum(self._row, 0)]
         self._moves = None
-        self.alive = self.bins.any_move(self.items, self.alive & (self._row >= 0))
+        full = self.bins.state.count >= self.spec.max_boxes
+        self.alive = self.bins.any_move(self.items, self.alive & (self._row >= 0) & ~full)
 
-    def place(self, moves: NDArray[np.int64]) -> ExactOutcome:
+    def place(self, moves: ArrayLike, *, check: bool = True) -> ExactOutcome:
         """Place the visible box in each game; games that have ended ignore their move.
 
         Args:
-            moves: int64 [G], legal moves: members of :attr:`moves`.
+            moves: whole numbers [G], legal moves such as members of :attr:`moves`.
+            check: whether to check that they are legal.
 
         Raises:
-            ValueError: if a game that is played gets NOWHERE.
+            ValueError: if a game that is played gets a move that is not legal. Nothing has changed
+                then.
         """
-        moves = np.where(self.alive, moves, NOWHERE)
+        numbers = np.asarray(moves)
+        if numbers.shape != (self.n,) or numbers.dtype.kind not in "iu":
+            raise ValueError(f"moves: needs whole numbers [{self.n}], not {described(numbers)}")
+        moves = np.where(self.alive, numbers.astype(np.int64), NOWHERE)
         lost = self.alive & (moves < 0)
+        if check:
+            lost |= ~self.bins.legal(self.items, moves)
         if lost.any():
             raise ValueError(f"game {int(lost.argmax())}: needs one of its legal moves")
         placed = self.alive.copy()
@@ -186,7 +200,7 @@ class ExactPacking:
             games: whole numbers, a slice or bool [G].
         """
         other = copy.copy(self)
-        index = np.arange(self.n)[games]
+        index = np.atleast_1d(np.arange(self.n)[games])
         other.n, other.auto_reset = len(index), False
         other.bins = self.bins.select(index)
         for name in ("episode", "t", "alive", "rows", "orientations", "_row"):

@@ -25,6 +25,8 @@ from marl_pack.items.names import check_names
 if TYPE_CHECKING:
     from marl_pack.exact.packing import ExactPacking
 
+LARGEST_WEIGHT = 1e9
+"""Largest weight of a feature."""
 TUNED = Path(__file__).with_name("linear.json")
 """Weights of the policy ``linear`` that come with the package (docs/millimetres.md)."""
 
@@ -81,7 +83,10 @@ def linear_weights(weights: Mapping[str, float]) -> NDArray[np.float64]:
     check_names(weights, FEATURES, (), "weights", "feature")
     vector = np.zeros(len(FEATURES))
     for name, weight in weights.items():
-        vector[FEATURES.index(name)] = real_number(weight, name)
+        number = real_number(weight, name)
+        if abs(number) > LARGEST_WEIGHT:
+            raise ValueError(f"{name} = {number:g}: needs a weight from -1e9 to 1e9")
+        vector[FEATURES.index(name)] = number
     return vector
 
 
@@ -138,6 +143,8 @@ def make_exact_policy(name: Any, seed: int = 0) -> ExactPolicy:
     if name in HEURISTICS:
         return HEURISTICS[name]()
     if isinstance(name, str | Path) and str(name).endswith(".json"):
+        if not Path(name).is_file():
+            raise FileNotFoundError(f"{name}: no such file")
         return Scored(LINEAR, read_weights(Path(name)))
     guess = renamed.guess(name, NAMES) if isinstance(name, str) else ""
     names = ", ".join(NAMES)

@@ -162,3 +162,38 @@ def add_rectangle(x0: int, y0: int, x1: int, y1: int, points: Any, n: int) -> in
     points[n + 2, 0], points[n + 2, 1] = x1, y1
     points[n + 3, 0], points[n + 3, 1] = x0, y1
     return n + 4
+
+
+@njit(cache=True, inline="always")
+def is_rectangle(polygon: Any) -> bool:
+    """Return whether a polygon of four corners is a rectangle along the axes.
+
+    The corners are counter-clockwise and begin with the lowest x, then y, as in a convex hull.
+    """
+    return bool(
+        polygon[1, 1] == polygon[0, 1]
+        and polygon[2, 0] == polygon[1, 0]
+        and polygon[3, 0] == polygon[0, 0]
+        and polygon[3, 1] == polygon[2, 1]
+    )
+
+
+@njit(cache=True, inline="always")
+def has_area(points: Any, first: int, last: int) -> bool:
+    """Return whether the part that :func:`clip` appended has an area.
+
+    The common part of a convex polygon and a rectangle that has none is a point, or a segment along
+    a side of the rectangle. It cannot carry a load: the smallest shift would leave it.
+
+    Args:
+        points: int64 [≥ last, 2].
+        first, last: the rows of the part.
+    """
+    if first == last:
+        return False
+    low_x = high_x = points[first, 0]
+    low_y = high_y = points[first, 1]
+    for i in range(first + 1, last):
+        low_x, high_x = min(low_x, points[i, 0]), max(high_x, points[i, 0])
+        low_y, high_y = min(low_y, points[i, 1]), max(high_y, points[i, 1])
+    return low_x < high_x and low_y < high_y

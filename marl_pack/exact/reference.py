@@ -54,7 +54,10 @@ def corners(rectangle: Rectangle) -> Polygon:
 
 
 def clip(polygon: Polygon, rectangle: Rectangle) -> Polygon:
-    """Return the part of a convex polygon inside a rectangle (Sutherland & Hodgman 1974)."""
+    """Return the part of a convex polygon inside a rectangle (Sutherland & Hodgman 1974).
+
+    A part without an area is no part: it cannot carry a load, as the smallest shift would leave it.
+    """
     for a, b in edges(corners(rectangle)):
         kept: Polygon = []
         for p, q in edges(polygon) if polygon else ():
@@ -65,7 +68,8 @@ def clip(polygon: Polygon, rectangle: Rectangle) -> Polygon:
                 t = Fraction(side_p) / (side_p - side_q)
                 kept.append((p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])))
         polygon = kept
-    return polygon
+    area = sum(p[0] * q[1] - p[1] * q[0] for p, q in edges(polygon)) if polygon else 0
+    return polygon if area else []
 
 
 def hull_of(points: Sequence[Point]) -> Polygon:

@@ -31,7 +31,14 @@ from marl_pack.exact.limits import (
     SCALE,
     Limits,
 )
-from marl_pack.exact.polygons import add_rectangle, clip, convex_hull, deeper
+from marl_pack.exact.polygons import (
+    add_rectangle,
+    clip,
+    convex_hull,
+    deeper,
+    has_area,
+    is_rectangle,
+)
 from marl_pack.installation import njit
 
 NO, YES, OPEN = 0, 1, 2
@@ -134,21 +141,19 @@ def gather(
         else:
             first, size = starts[j], starts[j + 1] - starts[j]
             polygon = parts[first : first + size]
-            bx, by = boxes[j, 0] * SCALE, boxes[j, 1] * SCALE
-            whole = (
-                size == 4
-                and polygon[0, 0] == bx and polygon[0, 1] == by
-                and polygon[2, 0] == bx + boxes[j, 3] * SCALE
-                and polygon[2, 1] == by + boxes[j, 4] * SCALE
-            )  # fmt: skip
-            if whole:
-                n = add_rectangle(x0 * SCALE, y0 * SCALE, x1 * SCALE, y1 * SCALE, points, n)
-                pieces += 1
+            if size == 4 and is_rectangle(polygon):
+                a0, b0 = max(x0 * SCALE, polygon[0, 0]), max(y0 * SCALE, polygon[0, 1])
+                a1, b1 = min(x1 * SCALE, polygon[2, 0]), min(y1 * SCALE, polygon[2, 1])
+                if a0 < a1 and b0 < b1:
+                    n = add_rectangle(a0, b0, a1, b1, points, n)
+                    pieces += 1
             else:
-                n = clip(
+                more = clip(
                     polygon, size, x0 * SCALE, y0 * SCALE, x1 * SCALE, y1 * SCALE, points, n
                 )  # fmt: skip
-                pieces += 2
+                if has_area(points, n, more):
+                    n = more
+                    pieces += 2
     return n, pieces == 1
 
 

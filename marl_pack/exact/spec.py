@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
+
+import numpy as np
 
 from marl_pack.checks import exact, shown, truth_value, whole_number
 from marl_pack.exact.lengths import check_unit, in_units, to_units
@@ -31,8 +32,13 @@ FINEST_SHARE = 10**6
 """Largest denominator of a share: areas times this number fit into int64."""
 
 
+def listed(value: Any) -> list[Any]:
+    """Return the values in a list, a tuple or an array; [] for anything else."""
+    return list(value) if isinstance(value, list | tuple | np.ndarray) else []
+
+
 def _size_mm(value: Any) -> tuple[float, float, float]:
-    sides = [] if isinstance(value, str | bytes | Mapping) else list(value)
+    sides = listed(value)
     if len(sides) != 3:
         raise ValueError(f"{shown(value)}: needs three lengths in millimetres, W D H")
     numbers = [finite_number(side) for side in sides]
@@ -71,7 +77,7 @@ def _thresholds(value: Any) -> Any:
 
 
 def _orientations(value: Any) -> tuple[int, ...]:
-    chosen = [] if isinstance(value, str | bytes | Mapping) else list(value)
+    chosen = listed(value)
     whole = all(isinstance(o, Integral) and not isinstance(o, bool) for o in chosen)
     if not chosen or not whole or not set(chosen) <= set(ALL_ORIENTATIONS):
         raise ValueError(f"{shown(value)}: need one or more of 0 … 5")
@@ -154,7 +160,8 @@ class ExactSpec(OptionRecord):
         nargs="+", type=int, metavar="O",
     )  # fmt: skip
     max_weight_kg: float | None = option(
-        None, "largest weight of all boxes in the bin, in kilograms; null for no limit.",
+        None, "largest weight of all boxes in the bin, in kilograms; null for no limit. A limit "
+        "refuses boxes of unknown weight.",
         _weight_limit, lambda limit: f"at most {limit:g} kg", type=float, metavar="KG",
     )  # fmt: skip
     alpha: float = option(
@@ -166,7 +173,8 @@ class ExactSpec(OptionRecord):
         lambda beta: f"beta {beta:g}", type=float,
     )  # fmt: skip
     max_boxes: int = option(
-        256, f"number of boxes that a bin has memory for, 1 to {MOST_BOXES}.",
+        256, f"largest number of boxes in a bin, 1 to {MOST_BOXES}; it has memory for so many, and "
+        "an episode ends there.",
         lambda value: whole_number(value, "max_boxes", 1, MOST_BOXES),
         lambda most: f"at most {most} boxes", type=int, metavar="N",
     )  # fmt: skip

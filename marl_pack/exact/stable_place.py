@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.checks import shown
 from marl_pack.exact.bins import ExactBins, placements
-from marl_pack.exact.goods import check_goods, goods_of
+from marl_pack.exact.goods import AXES, goods_of, number_rows
 from marl_pack.exact.lengths import to_mm, to_units
+from marl_pack.exact.present import check_present
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.option_record import document
 
@@ -30,7 +31,8 @@ def stable_place(
     Args:
         item: the box's own sides w, d, h in millimetres; or a mapping with ``items`` (one such row)
             and attributes (:func:`marl_pack.exact.goods.check_goods`).
-        boxes: numbers [k, 6], rows x, y, z, w, d, h in millimetres, the boxes in the bin.
+        boxes: numbers [k, 6], rows x, y, z, w, d, h in millimetres, the boxes in the bin; or a plan
+            of one bin.
         at: x, y of the box's low corner; by default all candidate positions at edges are tried.
         attributes: attributes of the boxes in the bin by key, such as ``weights``.
         **options: options of the game:
@@ -46,24 +48,23 @@ def stable_place(
         TypeError: for an unknown option.
     """
     spec = ExactSpec().with_options(options)
-    rows = np.asarray(boxes, np.float64).reshape(-1, 6)
-    spec = spec.with_options({"max_boxes": max(spec.max_boxes, len(rows) + 1)})
-    bins = ExactBins(1, spec)
-    if len(rows):
-        present = check_goods(rows[:, 3:], spec, source="boxes", **(attributes or {}))
-        bins.add_present(0, rows, present)
-    single = item if isinstance(item, Mapping) else np.asarray(item, np.float64).reshape(-1, 3)
-    goods = goods_of(single, spec, "item")
+    if isinstance(boxes, Sized):
+        spec = spec.with_options({"max_boxes": max(spec.max_boxes, len(boxes) + 1)})
+    bins = ExactBins(1, spec, check_present(boxes, spec, attributes))
+    goods = goods_of(item if isinstance(item, Mapping) else [item], spec, "item")
     if len(goods) != 1:
         raise ValueError(f"item: needs one box, not {len(goods)}")
     if at is None:
         moves = bins.moves(goods).numbers
     else:
-        corner, wrong = to_units(np.asarray(at, np.float64), spec.unit_mm)
-        if corner.shape != (2,) or wrong.any() or (corner < 0).any():
+        (corner,) = number_rows([at], 2, "at", "x y in mm")
+        units, wrong = to_units(corner, spec.unit_mm)
+        if wrong.any() or (units < 0).any():
             raise ValueError(
                 f"at = {shown(at)}: needs x, y ≥ 0 in whole units of {spec.unit_mm:g} mm"
             )
-        moves = np.sort(bins.moves_at(0, goods, corner[None]))
+        moves = np.sort(bins.moves_at(0, goods, units[None]))
+        _, first = np.unique(goods.sides[0][AXES[moves & 7]], axis=0, return_index=True)
+        moves = moves[np.sort(first)]  # orientations that make the same box count once
     where = placements(moves).reshape(-1, 4)
     return np.column_stack((where[:, 0], to_mm(where[:, 1:], spec.unit_mm)))

@@ -13,6 +13,8 @@ from marl_pack.exact.limits import EQUILIBRIUM, HULL_ALPHA, LBCP, Limits
 from marl_pack.exact.rules import carrying_part, find_contacts, make_scratch
 from marl_pack.installation import njit
 
+ROUNDING = 1e-12
+"""By this share a sum of weights may exceed a limit: 0.1 + 0.2 is not above 0.3."""
 PART_ROWS = 6
 """Rows of carrying parts for each box that bins begin with; they get more when they need it."""
 
@@ -26,7 +28,7 @@ class State(NamedTuple):
     known: Any  # bool [B, C]         whether the weight is known
     stackable: Any  # bool [B, C]     whether anything may rest on the box
     max_load: Any  # float64 [B, C]   largest weight of all boxes above it
-    carried: Any  # float64 [B, C]    known weights of all boxes above it
+    carried: Any  # float64 [B, C]    weights of all boxes above it; inf if one is unknown
     below: Any  # uint64 [B, C, ⌈C / 64⌉]  bits of all boxes that carry a box, through every contact
     grounded: (
         Any  # bool [B, C]      everything under it is filled, and what it rests on is grounded
@@ -103,8 +105,8 @@ def add_box(
         below[n] |= below[j]
         below[n, j // 64] |= np.uint64(1) << np.uint64(j % 64)
     for j in range(n):
-        if known and (below[n, j // 64] >> np.uint64(j % 64)) & np.uint64(1):
-            state.carried[b, j] += weight
+        if (below[n, j // 64] >> np.uint64(j % 64)) & np.uint64(1):
+            state.carried[b, j] += weight if known else np.inf
     state.weights[b, n], state.known[b, n] = weight, known
     state.stackable[b, n], state.max_load[b, n] = stackable, max_load
     state.carried[b, n], state.grounded[b, n] = 0.0, grounded
@@ -129,11 +131,16 @@ def blocked_boxes(state: State, b: int, weight: float, known: bool, blocked: Any
     """
     n = state.count[b]
     for j in range(n):
-        limit = state.max_load[b, j]
-        full = limit < np.inf and (not known or state.carried[b, j] + weight > limit)
-        blocked[j] = full or not state.stackable[b, j]
-        for i in range(j):  # its own limits hold for whatever rests on j
+        blocked[j] = not state.stackable[b, j] or overloaded(
+            state.carried[b, j], weight, known, state.max_load[b, j]
+        )
+        for i in range(j):  # the limits of all boxes below j hold for whatever rests on j
             carries = (state.below[b, j, i // 64] >> np.uint64(i % 64)) & np.uint64(1)
-            if carries:
-                limit = state.max_load[b, i]
-                blocked[j] |= limit < np.inf and (not known or state.carried[b, i] + weight > limit)
+            if carries and overloaded(state.carried[b, i], weight, known, state.max_load[b, i]):
+                blocked[j] = True
+
+
+@njit(cache=True, inline="always")
+def overloaded(carried: float, weight: float, known: bool, limit: float) -> bool:
+    """Return whether a box that carries a weight may not carry one more."""
+    return limit < np.inf and (not known or carried + weight > limit * (1 + ROUNDING))

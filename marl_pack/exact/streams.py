@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,13 +11,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.checks import whole_number
+from marl_pack.checks import described, shown, whole_number
 from marl_pack.exact.goods import GOODS_ATTRIBUTES, Goods, check_goods, goods_of
 from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.inputs import read_json
 from marl_pack.items.names import check_names
 from marl_pack.items.tables import read_sides, read_table, sequence_order
 
+LONGEST = 1e9
+"""No length in millimetres is longer."""
 SIDES = ("w_mm", "d_mm", "h_mm")
 COLUMNS = (*SIDES, *(attribute.column for attribute in GOODS_ATTRIBUTES), "sequence")
 """Columns of a CSV file of goods, and keys of the records of a JSON file."""
@@ -151,7 +154,7 @@ def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
         for attribute in GOODS_ATTRIBUTES
         if attribute.column in columns
     }
-    goods = check_goods(sides[order], spec, source=str(path), **values)
+    goods = check_goods(sides[order], spec, values, source=str(path))
     if "quantity" in values:
         quantity = np.array(values["quantity"], np.int64)
         counts = np.add.reduceat(quantity, counts.cumsum() - counts)
@@ -167,6 +170,8 @@ def _records(path: Path) -> dict[str, list[Any]]:
         if not isinstance(record, dict):
             raise ValueError(f"{path}: row {i}: needs a record with the keys {', '.join(SIDES)}")
         check_names(record, COLUMNS, SIDES, f"{path}: row {i}", "key")
+        if not isinstance(record.get("sequence", ""), str | int):
+            raise ValueError(f"{path}: row {i}: sequence needs a text or a whole number")
         if set(record) != set(content[0]):
             raise ValueError(f"{path}: row {i}: needs the keys of row 0: {', '.join(content[0])}")
     return {name: [record[name] for record in content] for name in content[0]}
@@ -175,8 +180,9 @@ def _records(path: Path) -> dict[str, list[Any]]:
 def _numbers(rows: NDArray[Any], path: Path) -> NDArray[np.float64]:
     """Return rows of three numbers as float64 [R, 3]; refuse anything else."""
     for i, row in enumerate(rows.tolist()):
-        if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in row):
-            raise ValueError(f"{path}: row {i} is {row}: needs three lengths in mm")
+        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in row)
+        if not numbers or max(map(abs, row)) > LONGEST:
+            raise ValueError(f"{path}: row {i} is {shown(row)}: needs three lengths in mm")
     return rows.astype(np.float64)
 
 
@@ -190,16 +196,19 @@ def make_goods_stream(
             ``items`` and attributes, goods or a stream.
         spec: the game.
         order: ``"file"``: the sequences as they are given; with ``length`` the disjoint windows of
-            this many boxes. ``"draw"``: each box is drawn at random, all with equal probability, so
-            a row with a quantity of 3 comes three times as often.
+            this many boxes of all sequences, one after the other. ``"draw"``: each box is drawn at
+            random, all with equal probability, so a row with a quantity of 3 comes three times as
+            often.
         length: number of boxes in an episode; needed with ``"draw"``.
         seed: seed of the draws.
 
     Raises:
         ValueError: for an impossible argument; says what would be right.
     """
-    if not isinstance(items, str | Path | Goods | dict | list | tuple | np.ndarray):
+    if all(hasattr(items, name) for name in ("goods", "episodes", "sequence", "seeded")):
         stream: GoodsStream = items
+        if stream.goods.unit_mm != spec.unit_mm:
+            raise ValueError(f"items: needs a stream of goods in units of {spec.unit_mm:g} mm")
         return stream
     if order not in ORDERS:
         raise ValueError(f"order {order!r}: needs one of {', '.join(ORDERS)}")
@@ -207,6 +216,11 @@ def make_goods_stream(
         length = whole_number(length, "length", 1, 10**6)
     if isinstance(items, str | Path):
         goods, counts = read_goods(Path(items), spec)
+    elif not isinstance(items, Goods | Mapping | Sequence | np.ndarray):
+        raise ValueError(
+            f"items: {described(items)} is not a file, rows of sides in mm, a mapping, Goods or a "
+            "stream"
+        )
     else:
         goods = goods_of(items, spec)
         counts = np.array([len(goods)])

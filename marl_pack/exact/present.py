@@ -1,0 +1,91 @@
+"""Boxes that are in a bin before the first one is placed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_pack.checks import exact
+from marl_pack.exact.goods import Goods, check_goods, number_rows
+from marl_pack.exact.lengths import to_units
+from marl_pack.exact.spec import ExactSpec
+from marl_pack.plan import Plan
+
+NAME = "boxes already there"
+
+
+@dataclass(frozen=True)
+class Present:
+    """Boxes in a bin, from the lowest to the highest; :func:`check_present` checks them."""
+
+    rows: NDArray[np.int64]  # [k, 6]  x, y, z, w, d, h in units, as placed
+    goods: Goods  # [k]  their weights and limits
+
+
+def check_present(
+    boxes: Any, spec: ExactSpec, attributes: Mapping[str, Any] | None = None
+) -> Present:
+    """Check boxes that are in a bin, and return them in units.
+
+    Args:
+        boxes: numbers [k, 6], rows x, y, z, w, d, h in millimetres; or a plan of one bin with a
+            unit, whose weights are in kilograms.
+        spec: the game. The boxes need not satisfy its rule, margin or clearance.
+        attributes: attributes of the boxes by key, such as ``weights``
+            (:data:`marl_pack.exact.goods.GOODS_ATTRIBUTES`).
+
+    Raises:
+        ValueError: if a box reaches out of the bin, overlaps another one or floats, or a value is
+            impossible; the message names the box.
+    """
+    if isinstance(boxes, Plan):
+        if boxes.unit_mm is None or len(boxes.bin_sizes) != 1:
+            raise ValueError(f"{NAME}: needs a plan of one bin with unit_mm, not {boxes}")
+        attributes = {"weights": boxes.weights} | dict(attributes or {})
+        unit = exact(boxes.unit_mm)
+        boxes = boxes.boxes * unit.numerator / unit.denominator
+    rows = number_rows(boxes, 6, NAME, "x y z w d h in mm")
+    if not (attributes is None or isinstance(attributes, Mapping)):
+        raise ValueError(f"attributes of {NAME}: need a mapping, such as {{'weights': [1, 2]}}")
+    if "quantity" in (attributes or {}):
+        raise ValueError(f"attributes of {NAME}: 'quantity' has no meaning; give each box a row")
+    if len(rows) > spec.max_boxes:
+        raise ValueError(f"{len(rows)} {NAME}: needs at most max_boxes = {spec.max_boxes}")
+    units, wrong = to_units(rows, spec.unit_mm)
+    wrong |= units < np.array([0, 0, 0, 1, 1, 1])
+    for i in np.flatnonzero(wrong.any(1))[:1].tolist():
+        raise ValueError(
+            f"{NAME}: box {i} {rows[i].tolist()} needs x y z ≥ 0 and w d h > 0 in whole units of "
+            f"{spec.unit_mm:g} mm"
+        )
+    goods = check_goods(rows[:, 3:], spec, attributes, source=NAME, fit=False)
+    order = np.argsort(units[:, 2], kind="stable")
+    tolerance = spec.limits().tolerance
+    for k, i in enumerate(order.tolist()):
+        _check_box(i, units, order[:k].tolist(), spec.size, tolerance, rows[i].tolist())
+    return Present(units[order], goods[order])
+
+
+def _check_box(
+    i: int, units: NDArray[np.int64], below: Sequence[int], size: tuple[int, int, int],
+    tolerance: int, shown: list[float],
+) -> None:  # fmt: skip
+    """Refuse box i if it reaches out of the bin, overlaps a box that begins lower, or floats."""
+    name = f"{NAME}: box {i} {shown}"
+    low, high = units[i, :3], units[i, :3] + units[i, 3:]
+    if (high > np.array(size)).any():
+        raise ValueError(f"{name} reaches out of the bin")
+    supported = low[2] == 0
+    for k in below:
+        other_low, other_high = units[k, :3], units[k, :3] + units[k, 3:]
+        shares = np.minimum(high, other_high) - np.maximum(low, other_low)
+        if (shares > 0).all():
+            raise ValueError(f"{name} overlaps box {k}")
+        rests = 0 <= low[2] - other_high[2] <= tolerance
+        supported |= bool((shares[:2] > 0).all() and rests)
+    if not supported:
+        raise ValueError(f"{name} floats: it rests neither on the floor nor on a box")
