@@ -277,7 +277,7 @@ def measure(key: str) -> dict[str, Any]:
         rollout = play(stream, policy, options)
     figures = mean_utilization(rollout)
     figures["interval"] = figures.pop("low"), figures.pop("high")
-    return figures | {"ms_each": 1000 * rollout.seconds / max(1, int(rollout.packed.sum()))}
+    return figures
 
 
 def volume_bound(stream: str) -> dict[str, Any]:

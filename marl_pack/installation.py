@@ -2,17 +2,50 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+PACKAGE = Path(__file__).parent
+
+
+@cache
+def compiled_sources(package: Path = PACKAGE) -> str:
+    """Return a hash of the source files that compiled functions depend on.
+
+    These are the files with compiled functions and, because of constants, all files beside them;
+    in the folder of the package itself only the former.
+    """
+    sources = {path: path.read_bytes() for path in sorted(package.rglob("*.py"))}
+    compiled = {path for path, source in sources.items() if b"njit(" in source}
+    folders = {path.parent for path in compiled} - {package}
+    digest = hashlib.blake2b(digest_size=16)
+    for path, source in sources.items():
+        if path in compiled or path.parent in folders:
+            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + source)
+    return digest.hexdigest()
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of one function; a full disk or a damaged file does not stop the program."""
+    """Numba's cache of one function; a full disk or a damaged file does not stop the program.
+
+    A compiled function contains the functions that it calls. Numba compiles it again only if its
+    own file has changed; here it does so if any file with compiled functions has changed.
+    """
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp(), compiled_sources()
+        self._cache_file = IndexDataCacheFile(
+            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=stamp
+        )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled function; None if it is not in the cache or cannot be read."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from marl_pack.extras import missing
+from marl_pack.installation import compiled_sources
 
 PACKAGE = Path(__file__).parent.parent / "marl_pack"
 
@@ -54,6 +55,53 @@ def test_a_damaged_cache_is_compiled_around(tmp_path: Path) -> None:
         (file,) = tmp_path.rglob(f"*.{ending}")
         file.write_bytes(file.read_bytes()[:size])
         assert play() == expected
+
+
+def test_compiled_code_is_compiled_again_if_any_file_that_it_may_contain_changes(
+    tmp_path: Path,
+) -> None:
+    def write(name: str, text: str) -> str:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+        compiled_sources.cache_clear()
+        return compiled_sources(tmp_path)
+
+    write("program.py", "print(1)")
+    write("root.py", "@njit()\ndef f(): pass")
+    write("kernels/a.py", "@njit()\ndef g(): pass")
+    first = write("kernels/constants.py", "SCALE = 256")
+    assert write("program.py", "print(2)") == first
+    assert write("plain/b.py", "x = 1") == first
+    changed = [write("kernels/constants.py", "SCALE = 128"), write("root.py", "@njit()"),
+               write("kernels/a.py", "@njit()")]  # fmt: skip
+    assert len({first, *changed}) == 4
+
+
+def test_a_function_is_not_loaded_from_the_cache_of_other_sources(tmp_path: Path) -> None:
+    copy = shutil.copytree(
+        PACKAGE, tmp_path / "marl_pack", ignore=lambda *_: ["__pycache__", "models"]
+    )
+    code = (
+        "import numpy as np; from marl_pack.exact.bins import _waste_all\n"
+        "from marl_pack.exact.spec import ExactSpec; from marl_pack.exact.bins import ExactBins\n"
+        "bins = ExactBins(1, ExactSpec(bin_mm=(9, 9, 9), unit_mm=1))\n"
+        "item = np.array([[2, 2, 2]]); move = np.array([(3 << 43)])\n"
+        "print(_waste_all(bins.state, item, move)[0])\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "c")}
+
+    def waste() -> float:
+        output = subprocess.check_output(
+            [sys.executable, "-c", code], cwd=tmp_path, env=environment, text=True
+        )
+        return float(output)
+
+    assert waste() == 2 * 2 * 3
+    changed = copy / "exact" / "features.py"  # its function is compiled into that of bins.py
+    text = changed.read_text()
+    changed.write_text(text.replace("    return volume\n", "    return volume + 1\n", 1))
+    assert waste() == 2 * 2 * 3 + 1
 
 
 def test_a_missing_package_is_named_with_the_command_for_the_source() -> None:
