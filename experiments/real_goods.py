@@ -233,30 +233,38 @@ def play(stream: str, policy: str, options: str) -> Rollout:
 
 
 def play_cells(stream: str, policy: str, cell: int) -> Rollout:
-    """Play a stream on whole cells, sizes rounded up; the plans have the true sizes."""
+    """Play a stream on whole cells, sizes rounded up; the plans have the true sizes.
+
+    A sequence ends before the first box that is too large when it is rounded up.
+    """
     from marl_pack.agents.heuristics import make_policy
 
     spec = spec_of(stream, "--rule none")
     source, episodes = make_stream(stream, spec)
-    sequences = [source.sequence(e) for e in range(episodes)]
     units = source.goods.sides // 10  # millimetres
-    rounded = np.array([-(-units[rows] // cell) for rows in sequences])
     width, depth, height = (side // cell for side in BINS[stream])
+    rounded = -(-units // cell)
+    long, short = rounded[:, :2].max(1), rounded[:, :2].min(1)
+    fits = (long <= max(width, depth)) & (short <= min(width, depth)) & (rounded[:, 2] <= height)
+    sequences = [source.sequence(e) for e in range(episodes)]
+    sequences = [rows[: int(np.append(fits[rows], False).argmin())] for rows in sequences]
+    played = [rounded[rows] for rows in sequences if len(rows)]
     game = Packing(
-        episodes,
-        (width, depth, height),
-        items=rounded,
-        rule="hull_alpha",
-        orientations=(0, 1),
+        len(played), (width, depth, height), items=played, rule="hull_alpha", orientations=(0, 1),
         auto_reset=False,
-    )
+    )  # fmt: skip
     chosen = make_policy(policy)
     start = time.perf_counter()
     while game.alive.any():
         game.place(*chosen(game))
     seconds = time.perf_counter() - start
+    packed = iter(game.plans())
     plans = []
-    for plan, rows in zip(game.plans(), sequences, strict=True):
+    for rows in sequences:
+        if not len(rows):
+            plans.append(Plan.of_boxes(BINS[stream], np.empty((0, 6), np.int64), unit_mm=1.0))
+            continue
+        plan = next(packed)
         boxes = plan.boxes.astype(np.int64) * cell
         true = units[rows[: len(boxes)]]
         turned = plan.orientations == 1
