@@ -12,6 +12,7 @@ from docstring_parser import parse
 
 from marl_pack import env_aec
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES
+from marl_pack.exact.features import FEATURES
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.export import OUTPUTS, example
 from marl_pack.game.spec import GameSpec
@@ -110,12 +111,13 @@ def between(page: str, name: str, text: str) -> str:
 
 
 def millimetres_page(page: str) -> str:
-    """Return docs/millimetres.md with its rows of options."""
+    """Return docs/millimetres.md with its tables of options and features."""
     rows = [("option", "default", "")]
     for option in fields(ExactSpec):
         sentence = option.metadata["sentence"].replace("null", "None")
         rows.append((f"`{option.name}`", f"`{option.default!r}`", sentence))
-    return between(page, "options", table(*rows))
+    features = [("feature", "what it is"), *((f"`{k}`", text) for k, text in FEATURES.items())]
+    return between(between(page, "options", table(*rows)), "features", table(*features))
 
 
 PAGES = {

@@ -35,7 +35,7 @@ from marl_pack.exact.packing import ExactPacking
 from marl_pack.exact.policies import HEURISTICS, make_exact_policy, named_weights
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.streams import Draws, GoodsStream, windows
-from marl_pack.exact.tuning import Episodes, Generation, tune, utilizations
+from marl_pack.exact.tuning import Episodes, tune, utilizations
 from marl_pack.files import write_json
 from marl_pack.game.packing import Packing
 from marl_pack.plan import Plan
@@ -154,49 +154,38 @@ def tuning_stream(name: str, spec: ExactSpec, seed: int) -> GoodsStream:
     return ShuffledOrders(goods, [np.array(order) for order in orders.values()], 1000 + seed)
 
 
-def tune_weights(names: list[str], out: str, minutes: float, games: int, seed: int) -> None:
-    """Tune the weights of ``linear`` for one stream or several, and write them.
+def tune_weights(name: str, minutes: float, games: int, seed: int) -> None:
+    """Tune the weights of ``linear`` for one stream, and write them.
 
-    For several streams the search improves the mean of the utilizations, each relative to that of
-    ``max_contact``.
+    Args:
+        name: the stream (:func:`tuning_stream`).
+        minutes: how long to search.
+        games: episodes in a generation.
+        seed: seed of episodes and search.
     """
-    streams = []
-    start = HEURISTICS["max_contact"]().weights
-    for name in names:
-        spec = spec_of(name.split("_")[0], TUNED_FOR)
-        stream = tuning_stream(name, spec, seed)
-        episodes = Episodes(stream, seed)
-        base = utilizations(start, stream, spec, episodes.measuring(100)).mean()
-        streams.append((stream, spec, episodes, float(base) * len(names)))
-    begin = time.monotonic()
-    console = make_console()
-    shown = 0.0
+    spec = spec_of(name.split("_")[0], TUNED_FOR)
+    stream = tuning_stream(name, spec, seed)
+    episodes, start = Episodes(stream, seed), HEURISTICS["max_contact"]().weights
+    held_back = episodes.measuring(100)
 
-    def share(weights: NDArray[np.float64], chosen: list[list[int]]) -> float:
-        return sum(
-            float(utilizations(weights, stream, spec, numbers).mean()) / base
-            for (stream, spec, _, base), numbers in zip(streams, chosen, strict=True)
-        )
+    def share(weights: NDArray[np.float64], numbers: list[int]) -> float:
+        return float(utilizations(weights, stream, spec, numbers).mean())
 
-    search = tune(
-        share, lambda: [episodes.tuning(games) for _, _, episodes, _ in streams], start=start,
-        seed=seed,
-    )  # fmt: skip
-    generation: Generation
-    for generation in search:
+    base, begin, shown, console = share(start, held_back), time.monotonic(), 0.0, make_console()
+    for generation in tune(share, lambda: episodes.tuning(games), start=start, seed=seed):
         spent = time.monotonic() - begin
         if spent - shown > 60 or spent > 60 * minutes:
             shown = spent
-            held = [episodes.measuring(100) for _, _, episodes, _ in streams]
+            relative = share(generation.weights, held_back) / base
             console.print(
-                f"{out}: generation {generation.number}, {spent:.0f} s, "
-                f"{share(generation.weights, held):.4f} of max_contact", soft_wrap=True
+                f"{name}: generation {generation.number}, {spent:.0f} s, {relative:.4f} of "
+                "max_contact", soft_wrap=True
             )  # fmt: skip
-            write_json(WEIGHTS / f"{out}.json", {
-                "weights": named_weights(generation.weights), "streams": names,
+            write_json(WEIGHTS / f"{name}.json", {
+                "weights": named_weights(generation.weights), "streams": [name],
                 "options": TUNED_FOR, "generations": generation.number,
                 "seconds": round(spent), "games": games, "seed": seed,
-                "relative_to_max_contact": share(generation.weights, held),
+                "relative_to_max_contact": relative,
             })  # fmt: skip
         if spent > 60 * minutes:
             return
@@ -313,17 +302,14 @@ def main() -> int:
     """Measure the chosen rows, or tune weights."""
     rows = Rows("python -m experiments.real_goods", __doc__ or "")
     add = rows.options.add_argument
-    add("--tune", nargs="+", metavar="STREAM", default=[],
-        choices=("mix", "boards", "cases_a", "cases_b"),
-        help="tune weights for these streams together, and measure nothing")  # fmt: skip
-    add("--out", default="linear", help="name of the weights of several streams (default: linear)")
+    add("--tune", metavar="STREAM", choices=("mix", "boards", "cases_a", "cases_b"),
+        help="tune weights for this stream, and measure nothing")  # fmt: skip
     add("--minutes", type=float, default=10.0, help="how long to tune (default: 10)")
     add("--games", type=int, default=24, help="episodes in a generation (default: 24)")
     add("--seed", type=int, default=0, help="seed of the tuning (default: 0)")
     arguments = rows.parse()
-    if arguments.tune:
-        out = arguments.tune[0] if len(arguments.tune) == 1 else arguments.out
-        tune_weights(arguments.tune, out, arguments.minutes, arguments.games, arguments.seed)
+    if arguments.tune is not None:
+        tune_weights(arguments.tune, arguments.minutes, arguments.games, arguments.seed)
         return 0
     results = rows.results("real_goods")
     console = make_console()

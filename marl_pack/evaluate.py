@@ -27,6 +27,7 @@ from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equili
 from marl_pack.files import Growing, check_writable, same_plain_file, write_json
 from marl_pack.options import (
     GAME_NOTE,
+    IN_MM,
     MOST_AT_ONCE,
     ONLY_CELLS,
     ONLY_MM,
@@ -245,7 +246,8 @@ def check_world(arguments: argparse.Namespace) -> None:
     for name in ONLY_CELLS if in_mm else ONLY_MM:
         if getattr(arguments, name) is not None:
             flag = "--" + name.replace("_", "-")
-            raise ValueError(f"{flag}: goes with --world {'cells' if in_mm else 'mm'}")
+            hint = f"; here it is --{IN_MM[name].replace('_', '-')}" if name in IN_MM else ""
+            raise ValueError(f"{flag}: goes with --world {'cells' if in_mm else 'mm'}{hint}")
     if not in_mm:
         check_names(arguments)
     elif arguments.symmetric or arguments.device != "cpu" or arguments.threads != 1:

@@ -23,6 +23,10 @@ COMMON = frozenset(each.name for each in fields(GameSpec)) & {
 """Options that games on cells have, too."""
 ONLY_CELLS = ("sides", "bin", "margin", "mask_orientations", "com_offset", "max_items",
               "orientation", "placement", "plan")  # fmt: skip
+MM_POLICIES = ("max_contact", "linear", "dblf", "height_min", "best_fit", "random")
+"""Heuristics of games in millimetres (:data:`marl_pack.exact.policies.NAMES`)."""
+IN_MM = {"margin": "margin_mm", "bin": "bin_mm", "max_items": "max_boxes"}
+"""Options of games on cells, and what they are called in millimetres."""
 ONLY_MM = (
     *(each.name for each in fields(ExactSpec) if each.name not in COMMON),
     "order",
@@ -32,8 +36,8 @@ ONLY_MM = (
 MOST_AT_ONCE = 1024
 """The largest number of threads, and of processes that judge."""
 GAME_NOTE = """\
-The game is the one that the first learned policy was trained on; without a learned policy
-it is RS in a bin of 10 x 10 x 10 under hull_alpha. Options of the game change this. A
+The game on cells is the one that the first learned policy was trained on; without a learned
+policy it is RS in a bin of 10 x 10 x 10 under hull_alpha. Options of the game change this. A
 learned policy is a published model, a run's folder or a checkpoint."""
 
 
@@ -76,7 +80,9 @@ def add_mm_options(options: argparse.ArgumentParser) -> None:
     group = options.add_argument_group("game in millimetres (--world mm)")
     group.add_argument(
         "--world", choices=WORLDS, default=WORLDS[0],
-        help="cells: whole cells (default); mm: true sizes in millimetres, from --items FILE",
+        help="cells: whole cells (default); mm: true sizes in millimetres, from --items FILE, by "
+             f"--policy {', '.join(MM_POLICIES)} (default: {MM_POLICIES[0]}), a .json file of "
+             "marl-pack tune, or FILE.py:NAME",
     )  # fmt: skip
     group.add_argument(
         "--order", choices=ORDERS,

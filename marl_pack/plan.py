@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.checks import decimals, number_in, real_number, whole_number
+from marl_pack.checks import decimals, exact, number_in, real_number, whole_number
 from marl_pack.files import write_csv, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
@@ -217,6 +217,18 @@ class Plan:
     def boxes(self) -> Array:
         """Rows x, y, z, w, d, h of the boxes, [n, 6]."""
         return np.hstack((self.positions, self.sides))
+
+    @property
+    def boxes_mm(self) -> NDArray[np.float64]:
+        """Rows x, y, z, w, d, h of the boxes in millimetres, [n, 6].
+
+        Raises:
+            ValueError: if the plan is in abstract cells.
+        """
+        if self.unit_mm is None:
+            raise ValueError("the plan is in abstract cells: its unit_mm is None")
+        unit = exact(self.unit_mm)
+        return np.asarray(self.boxes * float(unit.numerator) / unit.denominator)
 
     @property
     def loads(self) -> NDArray[np.float64]:

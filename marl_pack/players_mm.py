@@ -20,6 +20,7 @@ from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.exact.streams import GoodsStream, make_goods_stream
 from marl_pack.items.generated import no_such_file
 from marl_pack.option_record import given_options
+from marl_pack.options import MM_POLICIES
 from marl_pack.plan import Plan
 from marl_pack.terminal import announce_compiling
 
@@ -82,12 +83,12 @@ def choose_mm(arguments: argparse.Namespace, console: Console) -> SetupMm:
     )  # fmt: skip
     policies = {
         name: make_exact_policy(own_policy(name) if is_own(name) else name, seed)
-        for name in arguments.policy or ["max_contact"]
+        for name in arguments.policy or MM_POLICIES[:1]
     }
     present: Plan | tuple[()] = ()
     if arguments.present is not None:
         if not arguments.present.is_file():
-            raise no_such_file(str(arguments.present))
+            raise FileNotFoundError(f"--present {arguments.present}: no such file")
         read = Plan.from_csv if arguments.present.suffix == ".csv" else Plan.from_json
         present = read(arguments.present)
         check_present(present, spec)  # refuses impossible boxes before the games begin

@@ -158,6 +158,12 @@ def test_a_file_gives_the_same_goods_as_csv_and_json(tmp_path: Path) -> None:
         ("a.json", "{}", "needs a list of records"),
         ("a.json", '[{"w_mm": 1, "d_mm": 2, "h_mm": "3"}]', "row 0 .* needs three lengths in mm"),
         ("a.json", '[{"w_mm": 1, "d_mm": 2}]', "no key 'h_mm'"),
+        (
+            "a.json",
+            '[{"w_mm": 1, "d_mm": 2, "h_mm": 3, "sequence": {}}]',
+            "needs a text or a whole",
+        ),
+        ("a.csv", "w_mm,d_mm,h_mm\n1,,3\n", "needs a value for each"),
         ("a.txt", "", "unknown ending '.txt'"),
     ],
 )
@@ -165,6 +171,27 @@ def test_a_wrong_file_is_refused(tmp_path: Path, name: str, text: str, message: 
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         make_goods_stream(tmp_path / name, SMALL)
+
+
+def test_a_value_that_is_left_out_is_the_default(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "w_mm,d_mm,h_mm,weight_kg,upright,stackable,max_load_kg,quantity,id,orientations\n"
+        "10,12,9,,,,,,,\n20,10,8,2,yes,no,7.5,2,b,0\n"
+    )
+    (tmp_path / "a.json").write_text(json.dumps([
+        {"w_mm": 10, "d_mm": 12, "h_mm": 9, "weight_kg": None},
+        {"w_mm": 20, "d_mm": 10, "h_mm": 8, "weight_kg": 2, "upright": True, "stackable": False,
+         "max_load_kg": 7.5, "quantity": 2, "id": "b", "orientations": [0]},
+    ]))  # fmt: skip
+    for name in ("a.csv", "a.json"):
+        rows, counts = read_goods(tmp_path / name, SMALL)
+        assert counts.tolist() == [3]
+        assert np.isnan(rows.weights[0])
+        assert rows.weights[1:].tolist() == [2, 2]
+        assert rows.stackable.tolist() == [True, False, False]
+        assert rows.max_load.tolist() == [np.inf, 7.5, 7.5]
+        assert rows.ids.tolist() == ["", "b", "b"]
+        assert rows.orientations.sum(1).tolist() == [6, 1, 1]
 
 
 def test_windows_and_draws() -> None:
@@ -542,9 +569,8 @@ def test_plans_have_ids_orientations_weights_and_whole_lengths() -> None:
     game = ExactPacking(1, items, bin_mm=(60, 50, 90), auto_reset=False)
     policy = make_exact_policy("dblf")
     game.place(policy(game))
-    plan = game.plan(0)
-    assert plan.unit_mm == 1.0
-    assert plan.sides.dtype == np.int64
+    assert game.plan(0).sides.dtype == np.int64
+    assert sorted(game.plan(0).boxes_mm[0, 3:].tolist()) == [10, 20, 30]
     game.place(policy(game))
     plan = game.plan(0)
     assert plan.unit_mm == 0.1
@@ -584,6 +610,18 @@ def test_present_boxes_are_in_every_bin_and_come_back_in_the_next_episode() -> N
     assert again.plan(0) == plan
     with pytest.raises(ValueError, match="needs a plan of one bin with unit_mm"):
         ExactPacking(1, [[60, 50, 25]], spec=SMALL, present=Plan.of_boxes((9, 9, 9), present[:0]))
+
+
+def test_present_boxes_have_attributes_that_a_plan_does_not_know() -> None:
+    plan = Plan.of_boxes((60, 50, 90), [[0, 0, 0, 60, 50, 20]], unit_mm=1)
+    item = [[60, 50, 20]]
+    for present, count in ((plan, 1), ({"boxes": plan, "stackable": [False]}, 0)):
+        game = ExactPacking(1, item, spec=SMALL, present=present, auto_reset=False)
+        assert bool(game.alive[0]) == bool(count)
+    with pytest.raises(ValueError, match="need weights, because max_weight_kg is set"):
+        ExactPacking(1, item, spec=SMALL, present=plan.boxes, max_weight_kg=9)
+    with pytest.raises(ValueError, match="did you mean 'stackable'"):
+        ExactPacking(1, item, spec=SMALL, present={"boxes": plan, "stackabel": [False]})
 
 
 def test_present_boxes_may_touch_walls_within_the_clearance() -> None:

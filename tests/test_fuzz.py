@@ -11,6 +11,7 @@ from fuzz.program import (
     arguments,
     attempt,
     games,
+    millimetres,
 )
 
 
@@ -23,6 +24,12 @@ def test_wrong_arguments_are_refused_in_one_line_or_right(tmp_path: Path) -> Non
 def test_random_games_equal_plain_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARL_PACK_CHECK", "1")
     for name, case in islice(games(seed=3, folder=tmp_path), 8):
+        outcome, detail = attempt(case)
+        assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
+
+
+def test_random_games_in_millimetres_pass_plain_checks(tmp_path: Path) -> None:
+    for name, case in islice(millimetres(seed=5, folder=tmp_path), 25):
         outcome, detail = attempt(case)
         assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
 

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from marl_pack.exact import balance, choice
 from marl_pack.exact.features import FEATURES
 from marl_pack.exact.goods import AXES, Goods
-from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.limits import EQUILIBRIUM, Limits
 from marl_pack.exact.moves import BITS, MASK, decode, list_moves, moves_at
 from marl_pack.exact.present import Present
@@ -476,20 +475,14 @@ class ExactBins:
         ids: Sequence[str] | None = None,
         orientations: ArrayLike | None = None,
     ) -> Plan:
-        """Return the plan of bin ``b``.
-
-        Its lengths are whole millimetres; if that is not possible, whole units.
+        """Return the plan of bin ``b``, in whole units of ``spec.unit_mm`` (``Plan.boxes_mm``).
 
         Args:
             b: number of the bin.
             ids: id of each box.
             orientations: orientation of each box.
         """
-        boxes = self.boxes(b)
-        size, unit = self.size, self.spec.unit_mm
-        mm = [to_mm(lengths, unit) for lengths in (size, boxes)]
-        if all((lengths % 1 == 0).all() for lengths in mm):
-            size, boxes, unit = mm[0].astype(np.int64), mm[1].astype(np.int64), 1.0
+        boxes, size, unit = self.boxes(b), self.size, self.spec.unit_mm
         weights = self.state.weights[b, : len(boxes)]
         loads = np.column_stack((weights, boxes[:, :2] + boxes[:, 3:5] / 2))
         return Plan.of_boxes(

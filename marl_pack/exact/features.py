@@ -15,22 +15,22 @@ from marl_pack.exact.moves import AXES, decode
 from marl_pack.exact.rules import shared
 from marl_pack.installation import njit
 
-FEATURES = (
-    "rest",  # height of the bottom, as a share of the bin's height
-    "top",  # height of the top, as a share of the bin's height
-    "bottom",  # share of the box's surface that touches from below
-    "sides",  # share of the surface that touches boxes at the sides
-    "walls",  # share of the surface that touches walls
-    "waste",  # space newly enclosed below the box, as a share of the column above its footprint
-    "level",  # share of the four sides along which a touching box has the same top
-    "gap_x",  # how far the next face along x is too close: 0 at no or a wide gap, 1 at a narrow one
-    "gap_y",  # the same along y
-    "along_x",  # distance of the middle from the nearest wall along x, as a share of W
-    "along_y",  # the same along y, as a share of D
-    "footprint",  # share of the bin's floor
-    "height",  # own height as a share of the bin's
-)
-"""Names of the features, in their order."""
+FEATURES = {
+    "rest": "height of the bottom, as a share of the bin's height",
+    "top": "height of the top, as a share of the bin's height",
+    "bottom": "share of the box's surface that touches from below",
+    "sides": "share of the surface that touches boxes at the sides",
+    "walls": "share of the surface that touches walls",
+    "waste": "space newly enclosed below the box, as a share of the column above its footprint",
+    "level": "share of the four sides along which a touching box has the same top",
+    "gap_x": "how far the next face along x is too close: 0 at no or a wide gap, 1 at a narrow one",
+    "gap_y": "the same along y",
+    "along_x": "distance of the middle from the nearest wall along x, as a share of W",
+    "along_y": "the same along y, as a share of D",
+    "footprint": "share of the bin's floor",
+    "height": "own height as a share of the bin's",
+}
+"""The features in their order, each with what it is."""
 (
     REST, TOP, BOTTOM, SIDES, WALLS, WASTE, LEVEL, GAP_X, GAP_Y, ALONG_X, ALONG_Y, FOOTPRINT, HEIGHT
 ) = range(len(FEATURES))  # fmt: skip

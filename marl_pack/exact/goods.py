@@ -40,6 +40,11 @@ GOODS_ATTRIBUTES: tuple[Attribute, ...] = (
     ),
 )  # fmt: skip
 """The attributes that users may give with goods."""
+DEFAULTS: dict[str, Any] = {
+    "weights": np.nan, "upright": False, "orientations": True, "ids": "", "quantity": 1,
+    "stackable": True, "max_load": np.inf,
+}  # fmt: skip
+"""What a row has that gives no value of an attribute."""
 KEYS = tuple(attribute.key for attribute in GOODS_ATTRIBUTES)
 
 
@@ -83,7 +88,8 @@ def check_goods(
     Args:
         sides_mm: numbers [R, 3], own sides w, d, h in millimetres.
         spec: the game, with its unit.
-        attributes: values of :data:`GOODS_ATTRIBUTES` by key, one for each row: ``weights``
+        attributes: values of :data:`GOODS_ATTRIBUTES` by key, one for each row, None for the
+            default: ``weights``
             (kilograms), ``upright``, ``orientations``, ``ids``, ``quantity``, ``stackable``,
             ``max_load`` (kilograms).
         source: name of the goods in messages.
@@ -105,16 +111,16 @@ def check_goods(
     _refuse((rows <= 0).any(1), rows, source, "zero or negative; needs sides > 0 mm")
     _refuse(
         inexact.any(1), rows, source,
-        f"needs whole units of {spec.unit_mm:g} mm; choose a smaller unit (unit_mm)",
+        f"needs whole units of {spec.unit_mm:g} mm; choose a smaller unit (unit_mm, --unit-mm)",
     )  # fmt: skip
     count = len(rows)
     goods = Goods(
         sides=units,
-        weights=values.get("weights", np.full(count, np.nan)),
+        weights=values.get("weights", np.full(count, DEFAULTS["weights"])),
         orientations=_allowed(values.get("orientations"), values.get("upright"), rows, source),
-        stackable=values.get("stackable", np.ones(count, np.bool_)),
-        max_load=values.get("max_load", np.full(count, np.inf)),
-        ids=np.array([str(name) for name in values.get("ids", [""] * count)], object),
+        stackable=values.get("stackable", np.full(count, DEFAULTS["stackable"])),
+        max_load=values.get("max_load", np.full(count, DEFAULTS["max_load"])),
+        ids=np.array([str(name) for name in values.get("ids", [DEFAULTS["ids"]] * count)], object),
         unit_mm=spec.unit_mm,
     )
     if fit:
@@ -186,19 +192,27 @@ def _room(spec: ExactSpec) -> NDArray[np.int64]:
 def _column(
     attribute: Attribute, values: Any, rows: NDArray[Any], source: str
 ) -> NDArray[Any]:  # fmt: skip
-    """Return the checked values of one attribute, [R, *shape]."""
+    """Return the checked values of one attribute, [R, *shape]; None means the default."""
+    count = len(rows)
     if not isinstance(values, np.ndarray):
-        values = (
-            list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
-        )
-    if len(values) != len(rows):
-        raise ValueError(
-            f"{source}: {attribute.key!r} needs one value for each of {len(rows)} rows"
-        )
-    array, wrong = attribute.read(values)
+        listed = isinstance(values, Sequence) and not isinstance(values, str)
+        values = list(values) if listed else []
+    if len(values) != count:
+        raise ValueError(f"{source}: {attribute.key!r} needs one value for each of {count} rows")
+    given = np.array([value is not None for value in values], np.bool_)
+    chosen = values if given.all() else [value for value in values if value is not None]
+    array, invalid = attribute.read(chosen)
+    wrong = np.zeros(count, np.bool_)
+    wrong[given] = invalid
     text = shown(values[int(wrong.argmax())])
     _refuse(wrong, rows, source, f"{attribute.column} {text}; needs {attribute.needs}")
-    return array
+    if given.all():
+        return array
+    full: NDArray[Any] = np.full(
+        (count, *attribute.shape), DEFAULTS[attribute.key], attribute.dtype
+    )
+    full[given] = array
+    return full
 
 
 def _allowed(

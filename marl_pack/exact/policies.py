@@ -80,13 +80,13 @@ def linear_weights(weights: Mapping[str, float]) -> NDArray[np.float64]:
     Raises:
         ValueError: for an unknown feature or a weight that is not a finite number.
     """
-    check_names(weights, FEATURES, (), "weights", "feature")
+    check_names(weights, tuple(FEATURES), (), "weights", "feature")
     vector = np.zeros(len(FEATURES))
     for name, weight in weights.items():
         number = real_number(weight, name)
         if abs(number) > LARGEST_WEIGHT:
             raise ValueError(f"{name} = {number:g}: needs a weight from -1e9 to 1e9")
-        vector[FEATURES.index(name)] = number
+        vector[list(FEATURES).index(name)] = number
     return vector
 
 

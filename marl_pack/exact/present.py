@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.checks import exact
-from marl_pack.exact.goods import Goods, check_goods, number_rows
+from marl_pack.exact.goods import KEYS, Goods, check_goods, number_rows
 from marl_pack.exact.lengths import to_units
 from marl_pack.exact.spec import ExactSpec
+from marl_pack.items.names import check_names
 from marl_pack.plan import Plan
 
 NAME = "boxes already there"
@@ -33,21 +33,26 @@ def check_present(
 
     Args:
         boxes: numbers [k, 6], rows x, y, z, w, d, h in millimetres; or a plan of one bin with a
-            unit, whose weights are in kilograms.
+            unit, whose weights are in kilograms; or a mapping with ``boxes`` (one of these) and
+            attributes by key, such as ``weights``, ``stackable`` and ``max_load``
+            (:data:`marl_pack.exact.goods.GOODS_ATTRIBUTES`). A plan does not say whether boxes are
+            stackable, and how much they may carry.
         spec: the game. The boxes need not satisfy its rule, margin or clearance.
-        attributes: attributes of the boxes by key, such as ``weights``
-            (:data:`marl_pack.exact.goods.GOODS_ATTRIBUTES`).
+        attributes: attributes of the boxes, as in a mapping.
 
     Raises:
         ValueError: if a box reaches out of the bin, overlaps another one or floats, or a value is
             impossible; the message names the box.
     """
+    if isinstance(boxes, Mapping):
+        attributes = {key: value for key, value in boxes.items() if key != "boxes"}
+        check_names(boxes, ("boxes", *KEYS), ("boxes",), NAME, "key")
+        boxes = boxes["boxes"]
     if isinstance(boxes, Plan):
         if boxes.unit_mm is None or len(boxes.bin_sizes) != 1:
             raise ValueError(f"{NAME}: needs a plan of one bin with unit_mm, not {boxes}")
         attributes = {"weights": boxes.weights} | dict(attributes or {})
-        unit = exact(boxes.unit_mm)
-        boxes = boxes.boxes * unit.numerator / unit.denominator
+        boxes = boxes.boxes_mm
     rows = number_rows(boxes, 6, NAME, "x y z w d h in mm")
     if not (attributes is None or isinstance(attributes, Mapping)):
         raise ValueError(f"attributes of {NAME}: need a mapping, such as {{'weights': [1, 2]}}")
@@ -63,6 +68,8 @@ def check_present(
             f"{spec.unit_mm:g} mm"
         )
     goods = check_goods(rows[:, 3:], spec, attributes, source=NAME, fit=False)
+    if spec.max_weight_kg is not None and np.isnan(goods.weights).any():
+        raise ValueError(f"{NAME}: need weights, because max_weight_kg is set")
     order = np.argsort(units[:, 2], kind="stable")
     tolerance = spec.limits().tolerance
     for k, i in enumerate(order.tolist()):

@@ -121,8 +121,8 @@ def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
     """Read a CSV or JSON file of goods.
 
     A CSV file has the columns :data:`COLUMNS`; only ``w_mm``, ``d_mm`` and ``h_mm`` are needed. A
-    JSON file has a list of records with the same keys. Rows with the same ``sequence`` belong to
-    one sequence.
+    JSON file has a list of records with such keys. A value that is left out is the default. Rows
+    with the same ``sequence`` belong to one sequence.
 
     Args:
         path: the file.
@@ -136,18 +136,20 @@ def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
     """
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        columns: dict[str, Any] = dict(read_table(path, COLUMNS, SIDES))
+        columns: dict[str, Any] = dict(read_table(path, COLUMNS, SIDES, blanks=True))
         sides = read_sides(path, columns, SIDES, "a length in mm")
         for attribute in GOODS_ATTRIBUTES:
             if attribute.column in columns:
-                columns[attribute.column] = attribute.of_cells(columns[attribute.column])
+                texts = columns[attribute.column]
+                given = iter(attribute.of_cells([text for text in texts if text]))
+                columns[attribute.column] = [next(given) if text else None for text in texts]
     elif suffix == ".json":
         columns = _records(path)
         sides = np.array([columns[name] for name in SIDES], object).T
         sides = _numbers(sides, path)
     else:
         raise ValueError(f"{path}: unknown ending {path.suffix!r}: needs one of .csv, .json")
-    names = list(map(str, columns.get("sequence", ["0"] * len(sides))))
+    names = [str(name or "") for name in columns.get("sequence", [""] * len(sides))]
     order, counts = sequence_order(names)
     values = {
         attribute.key: [columns[attribute.column][i] for i in order.tolist()]
@@ -156,13 +158,13 @@ def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
     }
     goods = check_goods(sides[order], spec, values, source=str(path))
     if "quantity" in values:
-        quantity = np.array(values["quantity"], np.int64)
+        quantity = np.array([1 if q is None else q for q in values["quantity"]], np.int64)
         counts = np.add.reduceat(quantity, counts.cumsum() - counts)
     return goods, counts
 
 
 def _records(path: Path) -> dict[str, list[Any]]:
-    """Return the columns of a JSON file with a list of records, which all have the same keys."""
+    """Return the columns of a JSON file with a list of records; None where a value is left out."""
     content = read_json(path)
     if not isinstance(content, list) or not content:
         raise ValueError(f"{path}: needs a list of records with the keys {', '.join(SIDES)}")
@@ -172,9 +174,8 @@ def _records(path: Path) -> dict[str, list[Any]]:
         check_names(record, COLUMNS, SIDES, f"{path}: row {i}", "key")
         if not isinstance(record.get("sequence", ""), str | int):
             raise ValueError(f"{path}: row {i}: sequence needs a text or a whole number")
-        if set(record) != set(content[0]):
-            raise ValueError(f"{path}: row {i}: needs the keys of row 0: {', '.join(content[0])}")
-    return {name: [record[name] for record in content] for name in content[0]}
+    used = [name for name in COLUMNS if any(name in record for record in content)]
+    return {name: [record.get(name) for record in content] for name in used}
 
 
 def _numbers(rows: NDArray[Any], path: Path) -> NDArray[np.float64]:

@@ -13,13 +13,16 @@ from marl_pack.inputs import read_lines
 from marl_pack.items.names import check_names
 
 
-def read_table(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[str, list[str]]:
+def read_table(
+    path: Path, names: Sequence[str], required: Sequence[str], blanks: bool = False
+) -> dict[str, list[str]]:
     """Read a CSV file; return the texts of each column by the column's name.
 
     Args:
         path: the file.
         names: the columns that it may have.
         required: the columns that it needs.
+        blanks: whether a row may have no value in a column that is not required.
 
     Raises:
         ValueError: for a column that is missing, unknown or given twice, or a row with too few
@@ -34,10 +37,12 @@ def read_table(path: Path, names: Sequence[str], required: Sequence[str]) -> dic
         raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
     # One list for all rows, row by row: a list for each row is three times slower.
     values: list[str] = []
+    needed = set(required)
     for line, row in lines:
         if len(row) > len(columns) and not any(row[len(columns) :]):
             del row[len(columns) :]
-        if len(row) != len(columns) or "" in row:
+        missing = [name for name, text in zip(columns, row, strict=False) if not text]
+        if len(row) != len(columns) or (missing and not (blanks and needed.isdisjoint(missing))):
             raise ValueError(
                 f"{path}: row {len(values) // len(columns)} (line {line}) is {shown(row)}: needs a "
                 f"value for each of {', '.join(columns)}"

@@ -178,7 +178,7 @@ def in_words(figures: dict[str, Any]) -> str:
         f"{figures['left_out']} of {figures['boxes']:,} boxes could not be inserted\n"
         f"utilization: {100 * figures['planned']:.2f} % planned, "
         f"{100 * figures['in_physics']:.2f}{error} % in physics (boxes that stood before the "
-        f"first collapse)\n"
+        f"first collapse;\nthose that a tilt or a shake brought down had stood)\n"
         f"{figures['seconds']:.1f} s for a trial"
     )
 

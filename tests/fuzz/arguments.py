@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import marl_pack
-from marl_pack import SearchSettings
+from marl_pack import SearchSettings, stable_place
 from marl_pack.env_aec import raw_env
 from marl_pack.stability import in_equilibrium, make_rule, stable_mask
 
@@ -41,6 +41,18 @@ def _play(**options: Any) -> None:
     policy = marl_pack.load("dblf")
     for _ in range(2):
         games.place(*policy(games))
+
+
+def _play_exact(**options: Any) -> None:
+    """Play two turns with a game in millimetres of these options."""
+    games = marl_pack.ExactPacking(**options)
+    policy = marl_pack.make_exact_policy("max_contact")
+    for _ in range(2):
+        games.place(policy(games))
+
+
+def _move_exact(moves: Any) -> None:
+    marl_pack.ExactPacking(2, [[30, 20, 10]]).place(moves)
 
 
 def _step(action: Any, **options: Any) -> None:
@@ -96,6 +108,20 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         marl_pack.load,
         lambda: {"source": "rs", "seed": 1, "symmetric": True, "search": SearchSettings(2, 3)},
     ),
+    "stable_place": (
+        stable_place,
+        lambda: {"item": [30, 20, 10], "boxes": [[0, 0, 0, 40, 30, 20]], "at": (5, 0),
+                 "attributes": {"weights": [2.0], "max_load": [9.0]}, "bin_mm": (60, 50, 90),
+                 "margin_mm": 2, "rule": "lbcp", "orientations": (0, 1)},
+    ),
+    "ExactPacking": (
+        _play_exact,
+        lambda: {"n": 2, "items": {"items": [[30, 20, 10], [20, 20, 20.5]], "weights": [1, 2],
+                                   "ids": ["a", 7], "upright": [True, False]},
+                 "order": "draw", "length": 4, "seed": 3, "bin_mm": (60, 50, 90),
+                 "clearance_mm": 1, "level_tolerance_mm": 0.5, "max_boxes": 8},
+    ),
+    "move": (_move_exact, lambda: {"moves": np.array([1, 2])}),
     "rows": (
         _play,
         lambda: {"n": 2, "seed": 1, "items": {"items": [[[2, 2, 2], [3, 3, 3]]],

@@ -82,6 +82,14 @@ def equilibria(seed: int, folder: Path) -> Iterator[Case]:
         yield f"stacks {seed}-{part}", lambda part=part: _done(check_equilibrium([seed, part], 10))
 
 
+def millimetres(seed: int, folder: Path) -> Iterator[Case]:
+    """Yield games in millimetres, checked by plain code."""
+    from .millimetres import cases
+
+    for name, case in cases(seed):
+        yield name, lambda case=case: _done(case())
+
+
 def item_files(seed: int, folder: Path) -> Iterator[Case]:
     """Yield files of items, and play the first turn with those that are taken."""
     from marl_pack.game.packing import Packing
@@ -161,7 +169,8 @@ def checkpoints(seed: int, folder: Path) -> Iterator[Case]:
 SOURCES: dict[str, Callable[[int, Path], Iterator[Case]]] = {
     source.__name__: source
     for source in (
-        arguments, settings, item_files, plan_files, checkpoints, games, hull_rules, equilibria
+        arguments, settings, item_files, plan_files, checkpoints, games, millimetres, hull_rules,
+        equilibria,
     )
 }  # fmt: skip
 
