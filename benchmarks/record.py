@@ -35,10 +35,11 @@ PROGRAMS = {
     "other_rules": "experiments.packing --tables other_rules",
     "bodies": "experiments.packing --tables bodies",
     **{name: f"experiments.{name}" for name in (
-        "ablations", "learning_curve", "planning", "afterstates", "volume_spread")},
+        "ablations", "learning_curve", "planning", "afterstates", "volume_spread",
+        "real_goods", "real_cell")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
     **{name: f"benchmarks.{name}" for name in (
-        "masks", "rules", "room", "game", "training", "play")},
+        "masks", "rules", "room", "game", "training", "play", "exact")},
 }  # fmt: skip
 """The program that makes each table."""
 

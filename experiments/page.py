@@ -1,9 +1,9 @@
-"""Make docs/results.md and the README's table from the figures in results/.
+"""Make the pages of results and the README's table from the figures in results/.
 
 ``python -m experiments.page`` writes them.
 
-The page's text is in ``experiments/results.md.jinja``. Its figures are in the JSON files that the
-programs of ``experiments/`` and ``benchmarks/`` write.
+The texts of the pages are in ``experiments/*.md.jinja``. Their figures are in the JSON files that
+the programs of ``experiments/`` and ``benchmarks/`` write.
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
 from docs.pages import between
 from docs.pages import table as markdown_table
-from experiments import ablations, packing, physics, planning
+from experiments import ablations, packing, physics, planning, real_cell, real_goods
 from experiments.rows import main_of, mean
 from marl_pack.files import write_atomically
 from marl_pack.physics import table1
 from marl_pack.stability import RULES
 
 PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
-TEMPLATE = "results.md.jinja"
 RS = "rs"
 POLICIES = {
     RS: "`rs`, trained on RS",
@@ -60,20 +59,8 @@ def render(folder: Path = RESULTS) -> str:
     Raises:
         ValueError: if figures are missing; names the commands that measure them.
     """
-    missing = [name for name in PROGRAMS if not Results(name, folder).path.is_file()]
-    if missing:
-        commands = ", ".join(f"`{made_by(name)}`" for name in missing)
-        raise ValueError(f"{folder}: figures are missing; run {commands}")
-    environment = Environment(
-        loader=FileSystemLoader(ROOT / "experiments"), undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False,
-    )  # fmt: skip
-    environment.filters |= {
-        "percent": percent, "signed": signed, "grouped": grouped, "number": number,
-        "plain": plain, "utilization": utilization,
-    }  # fmt: skip
-    tables = {name: Results(name, folder) for name in PROGRAMS}
-    return environment.get_template(TEMPLATE).render(
+    tables = tables_in(folder)
+    return template("results").render(
         {name: tables[name].row for name in ("other_rules", "masks", "room", "game")},
         rules_row=tables["rules"].row,
         training_rows=fastest(tables["training"].rows()),
@@ -104,6 +91,79 @@ def render(folder: Path = RESULTS) -> str:
         paper_table1=table1.PAPER,
         reported=reported(),
     )  # fmt: skip
+
+
+def tables_in(folder: Path) -> dict[str, Results]:
+    """Return all tables by name.
+
+    Raises:
+        ValueError: if figures are missing; names the commands that measure them.
+    """
+    missing = [name for name in PROGRAMS if not Results(name, folder).path.is_file()]
+    if missing:
+        commands = ", ".join(f"`{made_by(name)}`" for name in missing)
+        raise ValueError(f"{folder}: figures are missing; run {commands}")
+    return {name: Results(name, folder) for name in PROGRAMS}
+
+
+def template(page: str) -> Template:
+    """Return the template of a page."""
+    environment = Environment(
+        loader=FileSystemLoader(ROOT / "experiments"), undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False,
+    )  # fmt: skip
+    environment.filters |= {
+        "percent": percent, "signed": signed, "grouped": grouped, "number": number,
+        "plain": plain, "utilization": utilization,
+    }  # fmt: skip
+    return environment.get_template(f"{page}.md.jinja")
+
+
+def render_real_goods(folder: Path = RESULTS) -> str:
+    """Return the text of docs/real_goods.md; the arguments are those of :func:`render`."""
+    tables = tables_in(folder)
+    row = tables["real_goods"].row
+
+    def cell(stream: str, policy: str, options: str) -> str:
+        figures = row(f"{stream} {policy} {options}")
+        text = f"{utilization(figures)} ({figures['packed']:.1f})"
+        return f"**{text}**" if policy == "tuned" else text
+
+    return template("real_goods").render(
+        bound=lambda stream: row(f"{stream} {real_goods.BOUND}"),
+        made=lambda name: made(tables[name]), rules=real_goods.RULES, cells=real_goods.CELLS,
+        policies=real_goods.POLICIES, streams=real_goods.BINS, cell=cell, reported=reported(),
+        exact_rows=list(tables["exact"].rows().items()),
+    )  # fmt: skip
+
+
+def render_real_cell(folder: Path = RESULTS) -> str:
+    """Return the text of docs/real_cell.md; the arguments are those of :func:`render`."""
+    tables = tables_in(folder)
+    row = tables["real_cell"].row
+
+    def overview(stream: str, setting: str) -> dict[str, Any]:
+        rows = [row(f"{stream} / {setting} / {trial}") for trial in real_cell.TRIALS]
+        return {
+            "planned": rows[0]["planned"],
+            **{key: sum(each[key] for each in rows) for key in ("collapses", "results")},
+        }
+
+    return template("real_cell").render(
+        made=lambda name: made(tables[name]), sound=real_cell.SOUND, trials=real_cell.TRIALS,
+        settings=real_cell.SETTINGS, streams=real_goods.BINS,
+        strict=lambda stream, setting: row(f"{stream} / {setting} / {real_cell.STRICT}"),
+        trial_of=lambda stream, setting, trial: row(f"{stream} / {setting} / {trial}"),
+        overview=overview,
+    )  # fmt: skip
+
+
+PAGES = {
+    PAGE: render,
+    PAGE.with_name("real_goods.md"): render_real_goods,
+    PAGE.with_name("real_cell.md"): render_real_cell,
+}
+"""Every page of results, with the function that makes its text."""
 
 
 def fastest(rows: Mapping[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
@@ -273,8 +333,9 @@ def _write(text: str, file: BinaryIO) -> None:
 
 
 def main() -> int:
-    """Write the page and the README's table; return the exit status."""
-    for path, text in ((PAGE, render()), (README, readme(README.read_text("utf-8")))):
+    """Write the pages and the README's table; return the exit status."""
+    texts = {page: make() for page, make in PAGES.items()}
+    for path, text in (texts | {README: readme(README.read_text("utf-8"))}).items():
         write_atomically(path, partial(_write, text))
         print(f"{path}: {len(text.splitlines())} lines")
     return 0

@@ -1,4 +1,4 @@
-"""docs/results.md says what the figures in results/ say."""
+"""The pages of results say what the figures in results/ say."""
 
 import shutil
 from pathlib import Path
@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.record import RESULTS, Results
-from experiments.page import PAGE, README, readme, render
+from experiments.page import PAGE, PAGES, README, readme, render
 
 
-def test_the_page_is_what_its_figures_and_its_text_make() -> None:
-    assert PAGE.read_text("utf-8") == render(), "run `make results`"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_is_what_its_figures_and_its_text_make(page: Path) -> None:
+    assert page.read_text("utf-8") == PAGES[page](), "run `make results`"
 
 
 def test_the_page_has_at_most_200_lines() -> None:
