@@ -149,12 +149,21 @@ def render_real_cell(folder: Path = RESULTS) -> str:
             **{key: sum(each[key] for each in rows) for key in ("collapses", "results")},
         }
 
+    def collapsed(rows: Iterable[dict[str, Any]]) -> str:
+        counts = [(each["collapses"], each["results"]) for each in rows]
+        return f"{sum(c for c, _ in counts)} of {sum(n for _, n in counts):,}"
+
+    def placed(setting: str) -> str:
+        trials = [trial for trial in real_cell.TRIALS if trial.startswith("place")]
+        return collapsed(row(f"{s} / {setting} / {t}") for s in real_goods.BINS for t in trials)
+
     return template("real_cell").render(
         made=lambda name: made(tables[name]), sound=real_cell.SOUND, trials=real_cell.TRIALS,
         settings=real_cell.SETTINGS, streams=real_goods.BINS,
         strict=lambda stream, setting: row(f"{stream} / {setting} / {real_cell.STRICT}"),
         trial_of=lambda stream, setting, trial: row(f"{stream} / {setting} / {trial}"),
-        overview=overview,
+        overview=overview, placed=placed,
+        shaken=lambda stream, setting: collapsed([row(f"{stream} / {setting} / shake 0.2 g")]),
     )  # fmt: skip
 
 
