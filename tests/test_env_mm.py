@@ -142,7 +142,7 @@ def test_items_of_reset_options_are_played_once() -> None:
     environment = make()
     environment.reset(seed=1, options={"items": [[100, 100, 100]]})
     play(environment)
-    assert environment.unwrapped.plan.boxes_mm.tolist() == [[0, 0, 0, 100, 100, 100]]
+    assert environment.unwrapped.plan.boxes_mm[:, 3:].tolist() == [[100, 100, 100]]
     with pytest.raises(ValueError, match="fits into the bin"):
         environment.reset(options={"items": [[10000, 100, 100]]})
     environment.reset()

@@ -48,7 +48,7 @@ def check_names(
     missing = [name for name in required if name not in used]
     unknown = [name for name in used if name not in valid]
     problems = []
-    in_mm = [name for name in unknown if name.endswith("_mm")]
+    in_mm = [name for name in unknown if str(name).endswith("_mm")]
     if in_mm and "w" in valid:
         problems.append(f"{what} {in_mm[0]!r} is for games in millimetres (--world mm)")
     elif "w_mm" in valid and {"w", "d", "h"} & set(unknown):
