@@ -85,6 +85,7 @@ class Session:
         items: approximate number of items to train on.
         turns: approximate number of turns of both agents between two updates.
         bin_size: W, D, H in cells; with ``--world mm`` in millimetres.
+        sides: shortest and longest side of items on cells.
         seed: seed of weights and items.
 
     Args:
@@ -123,7 +124,7 @@ class Session:
         self.items, self.turns, self.seed = options.items, options.turns, options.seed
         self.episodes = options.episodes
         self.game = {"bin_size": tuple(options.bin), "sides": tuple(options.sides)}
-        self.bin_size = tuple(options.bin)
+        self.bin_size, self.sides = tuple(options.bin), tuple(options.sides)
         if self.in_mm:
             self.game, self.bin_size = MILLIMETRES, MILLIMETRES["bin_mm"]
         self.json: Path | None = options.json

@@ -546,7 +546,7 @@ MUTATIONS = (
        "exact_rules::a_polygon_of_four_corners_that_is_no_rectangle_is_not_the_whole_top"),
     _m("exact: the clearance is not kept to walls", "exact/moves.py",
        "        if clearance <= out[i] <= last and", "        if 0 <= out[i] <= length - side and",
-       "exact_game::a_clearance_adds_candidates_beside_edges_and_keeps_off_walls"),
+       "exact_game::no_edge_leads_a_box_into_the_clearance_of_a_wall"),
     _m("exact: orientations of the same box are listed twice", "exact/moves.py",
        "if not allowed[o] or h > size[2] or same_sides(item, o, allowed):",
        "if not allowed[o] or h > size[2]:",

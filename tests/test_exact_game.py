@@ -264,7 +264,10 @@ def test_the_load_counts_boxes_above_through_every_contact() -> None:
         1, spec, check_present(boxes, spec, {"weights": [1, 1, 4], "max_load": [6, 9, 9]})
     )
     assert bins.state.carried[0, :3].tolist() == [4, 4, 0]
-    assert len(bins.moves(goods([[60, 50, 10]], spec, weights=[2])).numbers)
+    top = goods([[60, 50, 10]], spec, weights=[2])
+    above = bins.select([0])
+    above.place(top, above.moves(top).numbers)
+    assert above.state.carried[0, :4].tolist() == [6, 6, 2, 0]
     assert not len(bins.moves(goods([[60, 50, 10]], spec, weights=[2.1])).numbers)
 
 
@@ -360,6 +363,15 @@ def test_a_clearance_adds_candidates_beside_edges_and_keeps_off_walls() -> None:
     for _, x, y, z in rows.tolist():
         near = x < 24 and x + 15 > 0 and y < 14 and y + 8 > 0
         assert z == 30 or not near
+
+
+def test_no_edge_leads_a_box_into_the_clearance_of_a_wall() -> None:
+    spec = SMALL.with_options({"orientations": (0,), "rule": "none", "clearance_mm": 2})
+    bins = ExactBins(1, spec, check_present([[16, 2, 0, 28, 46, 30]], spec))
+    rows = placements(bins.moves(goods([[15, 8, 10]], spec)).numbers)
+    assert 1 not in rows[:, 1]  # its high side would lie at the edge 16
+    assert rows[:, 1].min() == 2
+    assert rows[:, 1].max() == 43  # and not 44, its low side at the edge 44
 
 
 def test_equal_boxes_in_two_orientations_are_listed_once() -> None:
