@@ -367,7 +367,7 @@ def test_a_clearance_adds_candidates_beside_edges_and_keeps_off_walls() -> None:
 
 def test_no_edge_leads_a_box_into_the_clearance_of_a_wall() -> None:
     spec = SMALL.with_options({"orientations": (0,), "rule": "none", "clearance_mm": 2})
-    bins = ExactBins(1, spec, check_present([[16, 2, 0, 28, 46, 30]], spec))
+    bins = ExactBins(1, spec, check_present([[16, 2, 0, 28, 18, 30]], spec))
     rows = placements(bins.moves(goods([[15, 8, 10]], spec)).numbers)
     assert 1 not in rows[:, 1]  # its high side would lie at the edge 16
     assert rows[:, 1].min() == 2
