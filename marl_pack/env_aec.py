@@ -160,7 +160,7 @@ from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv
 
 from marl_pack.bins import COUNT, FILLED, HEIGHTMAP
-from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
+from marl_pack.checks import truth_value
 from marl_pack.env_turns import AGENTS as AGENTS
 from marl_pack.env_turns import (
     ORIENTATION,
@@ -340,8 +340,6 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self._game = self._stream_game
         self._all_masked = self._spec.mask_orientations  # an orientation chosen has a legal cell
         self._unit = max(self._game.size)
-        self._episode = -1  # number of the stream's last episode that was begun
-        self._seed: int | None = None  # seed of the stream; None before the first episode
         self._read_game()
 
         width, depth, _ = self._game.size
@@ -394,19 +392,7 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
             ValueError: for an impossible seed or impossible items, or if no episode has a legal
                 first item; then nothing has changed.
         """
-        if not isinstance(options, Mapping | None):
-            raise ValueError(f"options = {shown(options)}: needs a dict")
-        unknown = set(options or {}) - {"items"}
-        if unknown:
-            # This is not an error, since PettingZoo's API test sends its own option.
-            warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
-        episode = self._episode if seed is None else -1
-        if seed is not None:
-            seed = whole_number(seed, "seed", 0, LARGEST_SEED)
-        elif self._seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
-        else:
-            seed = self._seed
+        seed, episode = self._next_episode(seed, options)
         if options and options.get("items") is not None:
             try:
                 game = Packing(1, items=options["items"], spec=self._spec, auto_reset=False)

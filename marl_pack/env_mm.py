@@ -43,7 +43,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.checks import LARGEST_SEED, shown, whole_number
+from marl_pack.checks import whole_number
 from marl_pack.env_turns import AGENTS, ORIENTATION, PLACEMENT, TurnEnv, one_of
 from marl_pack.exact.bins import placements
 from marl_pack.exact.features import FEATURES
@@ -153,8 +153,6 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self._stream = make_goods_stream(items, self._spec, order=order, length=length)
         self._present = present
         self._game = self._new_game(self._stream)
-        self._seed: int | None = None  # seed of the stream; None before the first episode
-        self._episode = -1
         self._choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: self.max_moves}
         table = spaces.Box(0.0, 1.0, (self.max_moves, len(COLUMNS)), np.float32)
         self.action_spaces = {agent: spaces.Discrete(n) for agent, n in self._choices.items()}
@@ -191,19 +189,7 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
             ValueError: for an impossible seed or impossible items, or if no episode has a legal
                 first box; then nothing has changed.
         """
-        if not isinstance(options, Mapping | None):
-            raise ValueError(f"options = {shown(options)}: needs a dict")
-        unknown = set(options or {}) - {"items"}
-        if unknown:
-            # This is not an error, since PettingZoo's API test sends its own option.
-            warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
-        episode = self._episode if seed is None else -1
-        if seed is not None:
-            seed = whole_number(seed, "seed", 0, LARGEST_SEED)
-        elif self._seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
-        else:
-            seed = self._seed
+        seed, episode = self._next_episode(seed, options)
         if options and options.get("items") is not None:
             try:
                 stream = make_goods_stream(options["items"], self._spec)

@@ -6,6 +6,7 @@ millimetres. Both derive from :class:`TurnEnv`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from pettingzoo.utils.conversions import (
     turn_based_aec_to_parallel_wrapper,
 )
 
-from marl_pack.checks import real_number, truth_value, whole_number
+from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
 from marl_pack.game.state import Copied
 
 ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
@@ -57,6 +58,8 @@ class TurnEnv(Copied, AECEnv):
         self.agents: list[str] = []
         self._chosen: int | None = None
         self._packed = 0
+        self._seed: int | None = None  # seed of the stream; None before the first episode
+        self._episode = -1  # number of the stream's last episode that was begun
         self._choices: dict[str, int] = {}
 
     @property
@@ -73,6 +76,27 @@ class TurnEnv(Copied, AECEnv):
         return self.action_spaces[agent]
 
     # --- turns ------------------------------------------------------------------------------------
+
+    def _next_episode(self, seed: int | None, options: Mapping[str, Any] | None) -> tuple[int, int]:
+        """Check the arguments of ``reset``; return the stream's seed and its last episode.
+
+        Raises:
+            ValueError: for an impossible seed or options that are no mapping.
+        """
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"options = {shown(options)}: needs a dict")
+        unknown = set(options or {}) - {"items"}
+        if unknown:
+            # This is not an error, since PettingZoo's API test sends its own option.
+            warnings.warn(f"ignoring reset options {sorted(unknown)}: only 'items'", stacklevel=2)
+        episode = self._episode if seed is None else -1
+        if seed is not None:
+            seed = whole_number(seed, "seed", 0, LARGEST_SEED)
+        elif self._seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        else:
+            seed = self._seed
+        return seed, episode
 
     def _begin(self) -> None:
         """Begin an episode: both agents play, and nothing has been placed."""
