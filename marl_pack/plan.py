@@ -21,6 +21,7 @@ from marl_pack.files import write_csv, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
 from marl_pack.items.names import check_names
+from marl_pack.plan_columns import ALL_COLUMNS, BOX, COLUMNS, EXTRAS, UNIT
 
 if TYPE_CHECKING:
     from marl_pack.bins import Bins
@@ -33,15 +34,22 @@ SLACK = 1e-9
 LONGEST = 1e9
 """The largest length in a plan: products and sums of lengths stay exact enough."""
 
-UNIT = "unit_mm"  # key of the unit in JSON, CSV and .npz
-BOX = (
-    "id", "bin", "x", "y", "z", "w", "d", "h", "orientation", "weight", "centre_x", "centre_y"
-)  # fmt: skip
-"""Keys of a box in JSON, and the first columns of a CSV file."""
+VERSION = 2
+"""Version of a plan in JSON. Version 1 had no ``version`` and only the keys :data:`BOX`."""
 KEYS = (UNIT, "bins", "boxes")
-"""Keys of a plan in JSON."""
-COLUMNS = (*BOX, "bin_w", "bin_d", "bin_h", UNIT)
-"""Columns of a CSV file: every line repeats the size of its bin and the unit."""
+"""Keys that every plan has in JSON."""
+OPTIONAL = ("$schema", "version", "left_out")
+LEFT_OUT = ("id", "w", "d", "h", "reason")
+"""Keys of a box without a place."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A box that had no place."""
+
+    id: str
+    sides: tuple[float, float, float]  # own sides w, d, h in the plan's unit
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +72,14 @@ class Plan:
     centres: NDArray[np.float64]  # [n, 2]   x, y of the centre of mass in its bin
     ids: tuple[str, ...]  # [n]       "" where unknown
     unit_mm: float | None = None  # millimetres of one unit; None: abstract cells
+    # Values of marl_pack.plan_columns.EXTRAS; None stands for the defaults.
+    yaws: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] degrees
+    weights_assumed: NDArray[np.bool_] = None  # type: ignore[assignment]  # [n]
+    stackable: NDArray[np.bool_] = None  # type: ignore[assignment]  # [n]
+    max_loads: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] inf: no limit
+    supports: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] NaN: unknown
+    margins: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] NaN: unknown
+    left_out: tuple[LeftOut, ...] = ()  # boxes that had no place
 
     def __post_init__(self) -> None:
         n, b = len(self.positions), len(self.bin_sizes)
@@ -85,7 +101,12 @@ class Plan:
             array = array.astype(np.int64) if kinds.get(key) is np.int64 else decimals(array)
             array.flags.writeable = False
             object.__setattr__(self, key, array)
+        for extra in EXTRAS:
+            values = extra.array(getattr(self, extra.field), n)
+            values.flags.writeable = False
+            object.__setattr__(self, extra.field, values)
         object.__setattr__(self, "ids", tuple(self.ids))
+        object.__setattr__(self, "left_out", tuple(self.left_out))
         if len(self.ids) != n or not all(isinstance(name, str) for name in self.ids):
             raise ValueError(f"ids: needs one text for each of {n} boxes")
         self._check_values()
@@ -102,8 +123,12 @@ class Plan:
         self._refuse((self.sides <= 0).any(1), "needs sides longer than 0")
         size = self.bin_sizes[self.bins]
         slack = SLACK * size.max(1, initial=0)[:, None]
+        for extra in EXTRAS:
+            valid = extra.check(getattr(self, extra.field))
+            self._refuse(~valid, f"{extra.key}: needs {extra.needs}")
         high = self.positions + self.sides
-        outside = (self.positions < -slack) | (high > size + slack)
+        low_corners, high_corners = self.extents
+        outside = (low_corners < -slack) | (high_corners > size + slack)
         self._refuse(outside.any(1), "reaches out of its bin")
         wrong = (self.orientations < -1) | (self.orientations >= len(ORIENTATIONS))
         self._refuse(wrong, f"needs an orientation from 0 to {len(ORIENTATIONS) - 1}, or -1")
@@ -208,8 +233,13 @@ class Plan:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
             return NotImplemented
-        mine, theirs = ([getattr(plan, f.name) for f in fields(Plan)] for plan in (self, other))
-        return all(map(np.array_equal, mine[:-2], theirs[:-2])) and mine[-2:] == theirs[-2:]
+        if (self.ids, self.unit_mm, self.left_out) != (other.ids, other.unit_mm, other.left_out):
+            return False
+        arrays = [f.name for f in fields(Plan) if isinstance(getattr(self, f.name), np.ndarray)]
+        return all(
+            np.array_equal(mine, theirs, equal_nan=mine.dtype.kind == "f")
+            for mine, theirs in ((getattr(self, name), getattr(other, name)) for name in arrays)
+        )
 
     __hash__ = None  # type: ignore[assignment]  # arrays have no hash
 
@@ -217,6 +247,30 @@ class Plan:
     def boxes(self) -> Array:
         """Rows x, y, z, w, d, h of the boxes, [n, 6]."""
         return np.hstack((self.positions, self.sides))
+
+    @property
+    def extents(self) -> tuple[Array, Array]:
+        """Low and high corners [n, 3] of the space that boxes take along the axes.
+
+        They are those of the boxes themselves, but for boxes with a yaw.
+        """
+        low, high = self.positions, self.positions + self.sides
+        if not self.yaws.any():
+            return low, high
+        cos, sin = np.cos(np.radians(self.yaws)), np.abs(np.sin(np.radians(self.yaws)))
+        w, d = self.sides[:, 0], self.sides[:, 1]
+        grown = np.column_stack((w * cos + d * sin, w * sin + d * cos)) - self.sides[:, :2]
+        more = np.column_stack((grown / 2, np.zeros(len(self))))
+        return low - more, high + more
+
+    @property
+    def has_extras(self) -> bool:
+        """Whether a box has a value of :data:`EXTRAS` that is not the default."""
+        return any(
+            not extra.is_default(value)
+            for extra in EXTRAS
+            for value in getattr(self, extra.field).tolist()
+        )
 
     @property
     def boxes_mm(self) -> NDArray[np.float64]:
@@ -255,7 +309,7 @@ class Plan:
             bin_sizes, bins[which], self.positions[which], self.sides[which],
             self.orientations[which], self.weights[which], self.centres[which],
             tuple(name for name, chosen in zip(self.ids, which, strict=True) if chosen),
-            self.unit_mm,
+            self.unit_mm, **{e.field: getattr(self, e.field)[which] for e in EXTRAS},
         )  # fmt: skip
 
     # --- files of one plan ------------------------------------------------------------------------
@@ -268,8 +322,10 @@ class Plan:
         return [[name, *chain(*row)] for name, *row in zip(self.ids, *parts, strict=True)]
 
     @classmethod
-    def _of_rows(cls, bin_sizes: Any, rows: Sequence[Sequence[Any]], unit_mm: Any) -> Plan:
-        """Return the plan that has these rows (see :meth:`_rows`)."""
+    def _of_rows(
+        cls, bin_sizes: Any, rows: Sequence[Sequence[Any]], unit_mm: Any, **others: Any
+    ) -> Plan:
+        """Return the plan that has these rows (see :meth:`_rows`), and other fields."""
         table = dict(zip(BOX, zip(*rows, strict=True), strict=True)) if rows else {}
 
         def columns(*names: str) -> Array:
@@ -278,16 +334,29 @@ class Plan:
         return cls(
             np.asarray(bin_sizes), columns("bin").ravel(), columns("x", "y", "z"),
             columns("w", "d", "h"), columns("orientation").ravel(), columns("weight").ravel(),
-            columns("centre_x", "centre_y"), table.get("id", ()), unit_mm,
+            columns("centre_x", "centre_y"), table.get("id", ()), unit_mm, **others,
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan as a dict for JSON: ``unit_mm``, ``bins`` (rows W, D, H) and ``boxes``.
+        """Return the plan as a dict for JSON; ``plan.schema.json`` describes it.
 
-        Each box is a dict with the keys :data:`BOX`.
+        Its keys are ``version``, ``unit_mm``, ``bins`` (rows W, D, H), ``boxes`` and, if there are
+        any, ``left_out``. Each box is a dict with the keys :data:`BOX`, and those of
+        :data:`marl_pack.plan_columns.EXTRAS` where its value is not the default.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
-        return {UNIT: self.unit_mm, "bins": self.bin_sizes.tolist(), "boxes": boxes}
+        for extra in EXTRAS:
+            for box, value in zip(boxes, getattr(self, extra.field).tolist(), strict=True):
+                if not extra.is_default(value):
+                    box[extra.key] = value
+        sizes = self.bin_sizes.tolist()
+        content = {"version": VERSION, UNIT: self.unit_mm, "bins": sizes, "boxes": boxes}
+        if self.left_out:
+            content["left_out"] = [
+                dict(zip(LEFT_OUT, (box.id, *box.sides, box.reason), strict=True))
+                for box in self.left_out
+            ]
+        return content
 
     @classmethod
     def of_dict(cls, content: Any, source: str) -> Plan:
@@ -303,7 +372,10 @@ class Plan:
         prefix = f"{source}: not a plan in JSON"
         if not isinstance(content, dict):
             raise ValueError(f"{prefix}: needs an object with the keys {', '.join(KEYS)}")
-        check_names(content, KEYS, KEYS, prefix, "key")
+        version = content.get("version", VERSION)
+        if version not in range(1, VERSION + 1) or isinstance(version, bool):
+            raise ValueError(f"{prefix}: version {version!r}: needs 1 … {VERSION}")
+        check_names(content, (*KEYS, *OPTIONAL), KEYS, prefix, "key")
         sizes, boxes = content["bins"], content["boxes"]
         try:
             if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
@@ -314,16 +386,21 @@ class Plan:
                 for side in size:
                     real_number(side, "bins")
             for k, box in enumerate(boxes):
-                check_names(box, BOX, BOX, f"box {k}", "key")
+                check_names(box, (*BOX, *(e.key for e in EXTRAS)), BOX, f"box {k}", "key")
             rows = [[box[key] for key in BOX] for box in boxes]
-            for k, row in enumerate(rows):
+            others: dict[str, Any] = {extra.field: [] for extra in EXTRAS}
+            for k, (row, box) in enumerate(zip(rows, boxes, strict=True)):
                 _check_row(row, f"box {k}")
+                for extra in EXTRAS:
+                    value = extra.of_json(box[extra.key]) if extra.key in box else extra.default
+                    others[extra.field].append(value)
+            others["left_out"] = _left_out(content.get("left_out", []))
             if content[UNIT] is not None:
                 real_number(content[UNIT], UNIT)
         except ValueError as error:
             raise ValueError(f"{prefix}: {error}") from None
         try:
-            return cls._of_rows(sizes, rows, content[UNIT])
+            return cls._of_rows(sizes, rows, content[UNIT], **others)
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from None
 
@@ -340,20 +417,29 @@ class Plan:
         """
         return cls.of_dict(read_json(Path(path)), str(path))
 
-    def to_lines(self) -> list[list[Any]]:
+    def to_lines(self, extras: bool = False) -> list[list[Any]]:
         """Return the values of :data:`COLUMNS` for each box, in order, then for each empty bin.
 
-        Each line contains the size of its bin and the unit (``unit_mm``, empty for abstract cells),
-        so it can be read alone. In the line of an empty bin, the values of a box are empty.
+        The line of an empty bin has no values but the bin's number, its size and the unit.
+
+        Args:
+            extras: whether to add the values of :data:`marl_pack.plan_columns.EXTRAS`.
         """
         unit = "" if self.unit_mm is None else self.unit_mm
         sizes = self.bin_sizes.tolist()
         lines = [[*row, *sizes[row[1]], unit] for row in self._rows()]
         used = set(self.bins.tolist())
         nothing = [""] * (len(BOX) - 2)
-        return lines + [
+        empty = [
             ["", k, *nothing, *size, unit] for k, size in enumerate(sizes) if k not in used
         ]
+        if extras:
+            for extra in EXTRAS:
+                values = getattr(self, extra.field).tolist()
+                for line, value in zip(lines, values, strict=True):
+                    line.append(extra.to_text(value))
+            empty = [[*line, *[""] * len(EXTRAS)] for line in empty]
+        return lines + empty
 
     @classmethod
     def of_lines(cls, lines: Sequence[Sequence[str]], source: str) -> Plan:
@@ -368,17 +454,21 @@ class Plan:
         """
         sizes: dict[int, list[Any]] = {}
         rows, units = [], set()
+        others: dict[str, Any] = {extra.field: [] for extra in EXTRAS}
         for number, line in enumerate(lines):
             try:
-                if len(line) != len(COLUMNS):
+                if len(line) not in (len(COLUMNS), len(ALL_COLUMNS)):
                     raise ValueError(f"has {len(line)} values, needs {len(COLUMNS)}")
-                name, index, *values, width, depth, height, unit = line
+                cells = [*line[len(COLUMNS) :]] or [""] * len(EXTRAS)
+                name, index, *values, width, depth, height, unit = line[: len(COLUMNS)]
                 size = [number_in(side) for side in (width, depth, height)]
                 row: list[Any] = [name, number_in(index)]
                 if name or any(values):
                     row += map(number_in, values)
                     _check_row(row, "it")
                     rows.append(row)
+                    for extra, cell in zip(EXTRAS, cells, strict=True):
+                        others[extra.field].append(extra.of_text(cell))
                 if sizes.setdefault(row[1], size) != size:
                     raise ValueError(f"bin {row[1]} has different sizes")
                 units.add(number_in(unit) if unit else None)
@@ -387,13 +477,18 @@ class Plan:
         if len(units) != 1 or sorted(sizes) != list(range(len(sizes))):
             raise ValueError(f"{source}: needs one unit, and bins numbered from 0 without a gap")
         try:
-            return cls._of_rows([sizes[k] for k in sorted(sizes)], rows, units.pop())
+            return cls._of_rows([sizes[k] for k in sorted(sizes)], rows, units.pop(), **others)
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from None
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the plan as CSV: the names :data:`COLUMNS`, then :meth:`to_lines`."""
-        write_csv(Path(path), [COLUMNS, *self.to_lines()])
+        """Write the plan as CSV: the names of the columns, then :meth:`to_lines`.
+
+        CSV files do not have the boxes that had no place.
+        """
+        extras = self.has_extras
+        columns = ALL_COLUMNS if extras else COLUMNS
+        write_csv(Path(path), [columns, *self.to_lines(extras)])
 
     @classmethod
     def from_csv(cls, path: str | Path) -> Plan:
@@ -404,7 +499,7 @@ class Plan:
         """
         path = Path(path)
         (_, header), *lines = list(read_lines(path)) or [(0, [])]
-        if header != list(COLUMNS) or not lines:
+        if header not in (list(COLUMNS), list(ALL_COLUMNS)) or not lines:
             raise ValueError(f"{path}: needs the columns {','.join(COLUMNS)} and at least one line")
         return cls.of_lines([line for _, line in lines], str(path))
 
@@ -427,6 +522,24 @@ def _check_row(row: Sequence[Any], what: str) -> None:
             whole_number(value, f"{what}: {key}", -1)
         elif key != "id":
             real_number(value, f"{what}: {key}")
+
+
+def _left_out(rows: Any) -> tuple[LeftOut, ...]:
+    """Return the boxes without a place in JSON.
+
+    Raises:
+        ValueError: naming the box and what it needs.
+    """
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError("left_out: needs a list of objects")
+    boxes = []
+    for k, row in enumerate(rows):
+        check_names(row, LEFT_OUT, LEFT_OUT, f"left_out: box {k}", "key")
+        sides = tuple(real_number(row[key], f"left_out: box {k}: {key}") for key in "wdh")
+        if not all(isinstance(row[key], str) for key in ("id", "reason")):
+            raise ValueError(f"left_out: box {k}: id and reason need texts")
+        boxes.append(LeftOut(row["id"], (sides[0], sides[1], sides[2]), row["reason"]))
+    return tuple(boxes)
 
 
 def _volume(sides: Array) -> float:

@@ -25,11 +25,12 @@ from marl_pack.checks import shown
 from marl_pack.files import write_atomically, write_csv, write_json
 from marl_pack.inputs import read_arrays, read_json, read_lines
 from marl_pack.items.names import check_names
-from marl_pack.plan import COLUMNS, UNIT, Plan
+from marl_pack.plan import Plan
+from marl_pack.plan_columns import ALL_COLUMNS, COLUMNS, EXTRAS, UNIT
 
 NOT_PLANS = "not a file of plans from evaluate --save-stacks"
 REQUIRED = ("bin", "count", "boxes", "loads")
-NAMES = (*REQUIRED, "utilization", "orientations", "ids", "bins", UNIT)
+NAMES = (*REQUIRED, "utilization", "orientations", "ids", "bins", UNIT, *(e.key for e in EXTRAS))
 """Names of the arrays of an archive."""
 ENDINGS = (".npz", ".json", ".csv")
 OF_PLAN = ("policy", "episode")
@@ -65,8 +66,9 @@ def save_plans(path: Path, plans: Sequence[Plan], policy: str = "") -> None:
         content = [{"episode": e} | plan.to_dict() for e, plan in numbered]
         write_json(path, {"policy": policy, "plans": content})
     elif path.suffix.lower() == ".csv":
-        lines = ([policy, e, *line] for e, plan in numbered for line in plan.to_lines())
-        write_csv(path, [(*OF_PLAN, *COLUMNS), *lines])
+        extras = any(plan.has_extras for plan in plans)
+        lines = ([policy, e, *line] for e, plan in numbered for line in plan.to_lines(extras))
+        write_csv(path, [(*OF_PLAN, *(ALL_COLUMNS if extras else COLUMNS)), *lines])
     else:
         _save_arrays(path, plans)
 
@@ -83,7 +85,8 @@ def _save_arrays(path: Path, plans: Sequence[Plan]) -> None:
 
     The arrays are ``bin`` ([3], or [E, B, 3] unless every plan has one bin of the same size),
     ``count`` [E], ``boxes`` [E, M, 6], ``loads`` [E, M, 3], ``utilization`` [E], ``orientations``,
-    ``ids`` and ``bins`` [E, M], and ``unit_mm`` [E] (NaN: abstract cells).
+    ``ids`` and ``bins`` [E, M], and ``unit_mm`` [E] (NaN: abstract cells). If a box has a value of
+    :data:`marl_pack.plan_columns.EXTRAS`, there is an array [E, M] of each of them.
     """
     sizes = _padded([plan.bin_sizes for plan in plans])
     boxes = _padded([plan.boxes for plan in plans])
@@ -102,6 +105,8 @@ def _save_arrays(path: Path, plans: Sequence[Plan]) -> None:
         "bins": _padded([plan.bins for plan in plans]),
         UNIT: np.array(units),
     }
+    for extra in EXTRAS if any(plan.has_extras for plan in plans) else ():
+        arrays[extra.key] = _padded([getattr(plan, extra.field) for plan in plans])
     write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
@@ -150,7 +155,7 @@ def _load_csv(path: Path) -> list[Plan]:
     (_, header), *lines = list(read_lines(path)) or [(0, [])]
     if header[: len(OF_PLAN)] != list(OF_PLAN):
         return [Plan.from_csv(path)]
-    if header != [*OF_PLAN, *COLUMNS] or not lines:
+    if header not in ([*OF_PLAN, *COLUMNS], [*OF_PLAN, *ALL_COLUMNS]) or not lines:
         needs = ",".join((*OF_PLAN, *COLUMNS))
         raise ValueError(f"{path}: {NOT_PLANS}: needs the columns {needs} and at least one line")
     plans: list[Plan] = []
@@ -182,7 +187,10 @@ def _load_arrays(path: Path) -> list[Plan]:
     consistent = (
         boxes.shape == (e, most, 6) and loads.shape == (e, most, 3)
         and sizes.ndim == 3 and (len(sizes), sizes.shape[2]) == (e, 3)
-        and all(arrays[key].shape == (e, most) for key in ("orientations", "ids", "bins"))
+        and all(
+            arrays[key].shape == (e, most)
+            for key in ("orientations", "ids", "bins", *(x.key for x in EXTRAS if x.key in arrays))
+        )
         and count.shape == arrays[UNIT].shape == (e,) and count.dtype.kind in "iu" and e > 0
         and arrays[UNIT].dtype.kind in "iuf" and arrays["ids"].dtype.kind == "U"
         and (boxes.dtype.kind in "iu") == (size.dtype.kind in "iu")
@@ -199,6 +207,7 @@ def _load_arrays(path: Path) -> list[Plan]:
                 boxes[k, :n, 3:], arrays["orientations"][k, :n], loads[k, :n, 0],
                 loads[k, :n, 1:], tuple(arrays["ids"][k, :n].tolist()),
                 None if np.isnan(unit) else unit,
+                **{x.field: arrays[x.key][k, :n] for x in EXTRAS if x.key in arrays},
             ))  # fmt: skip
         except ValueError as error:
             raise ValueError(f"{path}: episode {k}: {error}") from None

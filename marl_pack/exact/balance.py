@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from marl_pack.checks import exact
 from marl_pack.exact.limits import SCALE, Limits
 from marl_pack.exact.moves import AXES, decode
-from marl_pack.exact.rules import find_contacts, make_scratch, margin_of, shared
+from marl_pack.exact.rules import carried_by, find_contacts, make_scratch, margin_of
 from marl_pack.exact.state import State
 from marl_pack.installation import njit
 from marl_pack.stability.exact_equilibrium import Load
@@ -67,7 +67,7 @@ def _new_parts(limits: Limits, state: State, b: int, x: int, y: int, z: int, w: 
     out, m = np.empty((starts[n], 4), np.int64), 0
     for t in range(k):
         j = scratch.touching[t]
-        x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
+        x0, y0, x1, y1 = carried_by(boxes, j, x, y, w, d)
         for r in range(starts[j], starts[j + 1]):
             a0, b0 = max(x0, parts[r, 0]), max(y0, parts[r, 1])
             a1, b1 = min(x1, parts[r, 2]), min(y1, parts[r, 3])
@@ -95,7 +95,7 @@ def in_balance(
     o, x, y, z = decode(move)
     w, d, h = (int(item[axis]) for axis in AXES[o])
     n = int(state.count[b])
-    boxes = np.vstack((state.boxes[b, :n], (x, y, z, w, d, h))).astype(np.int64)
+    boxes = np.vstack((state.boxes[b, :n, :6], (x, y, z, w, d, h))).astype(np.int64)
     loads = np.empty((n + 1, 3))
     loads[:, 0] = (*state.weights[b, :n], weight)
     loads[:, 1:] = boxes[:, :2] + boxes[:, 3:5] / 2

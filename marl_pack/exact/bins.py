@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from marl_pack.exact import balance, choice
 from marl_pack.exact.features import FEATURES
 from marl_pack.exact.goods import AXES, Goods
-from marl_pack.exact.limits import EQUILIBRIUM, Limits
+from marl_pack.exact.limits import EQUILIBRIUM, ROW, Limits
 from marl_pack.exact.moves import BITS, MASK, decode, list_moves, moves_at
 from marl_pack.exact.present import Present
 from marl_pack.exact.rules import NO, OPEN, YES
@@ -191,7 +191,7 @@ class ExactBins:
     @property
     def utilization(self) -> NDArray[np.float64]:
         """Share of each bin's volume that is filled, float64 [B]."""
-        sides = self.state.boxes[:, :, 3:].astype(np.float64)  # zeros beyond the last box
+        sides = self.state.boxes[:, :, 3:6].astype(np.float64)  # zeros beyond the last box
         return np.asarray(sides.prod(2).sum(1) / self.volume)
 
     @property
@@ -223,7 +223,7 @@ class ExactBins:
             items: one row for each bin.
             chosen: bool [B], the bins to list moves for; by default all.
         """
-        weights, known = self._weights(items)
+        weights, known = self._check(items)
         chosen = self._open(weights, known, chosen)
         starts = np.zeros(len(self) + 1, np.int64)
         room = FIRST_ROOM * max(1, len(self) // 16)
@@ -252,7 +252,7 @@ class ExactBins:
             items: one row for each bin.
             corners: int64 [K, 2], low corners x, y in units.
         """
-        weights, known = self._weights(items)
+        weights, known = self._check(items)
         if not self._open(weights, known, np.arange(len(self)) == b)[b]:
             return np.empty(0, np.int64)
         state, n = self.state, self.state.count[b]
@@ -278,7 +278,7 @@ class ExactBins:
             items: one row for each bin.
             moves: int64 [B].
         """
-        weights, known = self._weights(items)
+        weights, known = self._check(items)
         chosen = moves >= 0
         verdicts = _check_all(
             self.limits, self.size, self.state, items.sides, items.orientations, weights, known,
@@ -323,7 +323,7 @@ class ExactBins:
         Returns:
             The moves, int64 [B]; NOWHERE where an item has no place.
         """
-        weights, known = self._weights(items)
+        weights, known = self._check(items)
         chosen = self._open(weights, known, chosen)
         if self.limits.rule == EQUILIBRIUM:
             return self._best_listed(items, kind, score_weights, chosen)
@@ -398,13 +398,20 @@ class ExactBins:
             items: one row for each bin.
             moves: int64 [B]; NOWHERE: no placement, no waste.
         """
-        self._weights(items)  # checks the items
+        self._check(items)  # checks the items
         return _waste_all(self.state, items.sides, moves)
 
-    def _weights(self, items: Goods) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the items' weights, assumed from their volume where unknown, and which are known.
+    def weights_of(self, goods: Goods) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the weights of goods, assumed from their volume where unknown, and which are known.
 
         Unknown weights are those of boxes of :data:`marl_pack.sapien_check.stack.DENSITY`.
+        """
+        known = ~np.isnan(goods.weights)
+        metre = self.spec.unit_mm / 1000
+        return np.where(known, goods.weights, goods.volumes * metre**3 * DENSITY), known
+
+    def _check(self, items: Goods) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the items' weights (:meth:`weights_of`).
 
         Raises:
             ValueError: unless there is an item in the unit of the game for each bin.
@@ -414,9 +421,7 @@ class ExactBins:
                 f"items: {len(items)} in units of {items.unit_mm:g} mm; needs one for each of "
                 f"{len(self)} bins, in units of {self.spec.unit_mm:g} mm"
             )
-        known = ~np.isnan(items.weights)
-        metre = self.spec.unit_mm / 1000
-        return np.where(known, items.weights, items.volumes * metre**3 * DENSITY), known
+        return self.weights_of(items)
 
     def place(self, items: Goods, moves: NDArray[np.int64]) -> None:
         """Place an item in each bin where its move is not NOWHERE.
@@ -431,18 +436,24 @@ class ExactBins:
         Raises:
             ValueError: if a bin already holds ``max_boxes`` boxes.
         """
-        self._weights(items)  # checks the items
+        self._check(items)  # checks the items
         chosen = moves >= 0
-        rows = np.zeros((len(self), 6), np.int64)
         where = placements(np.maximum(moves, 0))
-        rows[:, :3] = where[:, 1:]
-        rows[:, 3:] = np.take_along_axis(items.sides, AXES[where[:, 0]], 1)
-        self._add(rows, items, chosen)
+        sides = np.take_along_axis(items.sides, AXES[where[:, 0]], 1)
+        self._add(np.hstack((where[:, 1:], sides)), items, chosen)
 
     def _add(self, rows: NDArray[np.int64], items: Goods, chosen: NDArray[np.bool_]) -> None:
-        """Add a box to each chosen bin; rows of carrying parts grow when they have to."""
+        """Add a box to each chosen bin; rows of carrying parts grow when they have to.
+
+        Args:
+            rows: int64 [B, 6], x, y, z, w, d, h; or [B, 10], rows of the state.
+            items: one row for each bin.
+            chosen: bool [B].
+        """
         self._refuse_full(chosen)
-        weights, known = self._weights(items)
+        if rows.shape[1] < ROW:  # the whole top carries
+            rows = np.hstack((rows, rows[:, :2], rows[:, :2] + rows[:, 3:5]))
+        weights, known = self._check(items)
         first = 0
         while True:
             first, needed = _place_all(
@@ -467,7 +478,7 @@ class ExactBins:
 
     def boxes(self, b: int) -> NDArray[np.int64]:
         """Return the boxes of bin ``b`` in units, int64 [count, 6], rows x, y, z, w, d, h."""
-        return self.state.boxes[b, : self.state.count[b]].astype(np.int64)
+        return self.state.boxes[b, : self.state.count[b], :6].astype(np.int64)
 
     def plan(
         self,

@@ -52,7 +52,7 @@ def enclosed_below(
     the highest to the lowest top, and each covers a part of what is still uncovered along y.
 
     Args:
-        boxes: int32 [C, 6].
+        boxes: int32 [C, 10].
         n: number of boxes.
         x, y, z: low corner of the placed box.
         w, d: sides of its footprint.
@@ -201,7 +201,7 @@ def describe(
     Args:
         limits: clearance and level tolerance.
         size: int64 [3], W, D, H.
-        boxes: int32 [C, 6].
+        boxes: int32 [C, 10].
         n: number of boxes.
         item: int64 [3], the item's own sides.
         move: the move.

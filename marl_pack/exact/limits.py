@@ -13,6 +13,14 @@ SCALE = 256
 """Lattice points of polygons in a unit of length. It is even: the middle of a box lies on the
 lattice."""
 
+ROW = 10
+"""Columns of a box: x, y, z, w, d, h; then x0, y0, x1, y1 of the rectangle of its top that carries.
+
+The first six are the space that others may not enter. The rectangle is the whole top, but for a box
+that a robot placed with a rotation: there it is a rectangle inside the rotated top."""
+CARRIES = 6
+"""First of the columns of the rectangle that carries."""
+
 NONE, AREA_RATIO, HULL_1, HULL_ALPHA, LBCP, EQUILIBRIUM = range(6)
 RULES = {
     "hull_1": HULL_1, "hull_alpha": HULL_ALPHA, "area_ratio": AREA_RATIO, "lbcp": LBCP,

@@ -45,7 +45,7 @@ def _positions(
     """Write the sorted positions along an axis at which a side lies at an edge; return their count.
 
     Args:
-        boxes: int32 [≥ n, 6].
+        boxes: int32 [≥ n, 10].
         n: number of boxes.
         axis: 0 for x, 1 for y.
         length: length of the bin along the axis.
@@ -126,7 +126,7 @@ def candidates(
     Args:
         limits: clearance and level tolerance.
         size: int64 [3], W, D, H.
-        boxes: int32 [C, 6], rows x, y, z, w, d, h.
+        boxes: int32 [C, 10], rows of the state.
         n: number of boxes.
         item: int64 [3], the item's own sides w, d, h.
         allowed: bool [6], orientations it may be placed in.
@@ -195,7 +195,7 @@ def stands(
 
     Args:
         limits: what a placement has to satisfy.
-        boxes: int32 [C, 6].
+        boxes: int32 [C, 10].
         n: number of boxes.
         starts, parts: the carrying parts (:func:`marl_pack.exact.rules.gather`).
         blocked: bool [C], boxes on which this item may not rest.

@@ -133,6 +133,10 @@ class ExactPacking:
             for sequence, t in zip(self._sequences, self.t.tolist(), strict=True)
         ])  # fmt: skip
 
+    def shown(self, g: int) -> Goods:
+        """Return the boxes that game ``g`` has shown so far, in order; the visible one is last."""
+        return self.stream.goods[self._sequences[g][: int(self.t[g]) + 1]]
+
     def _show(self) -> None:
         """Show the next box in each game; a game ends if it has no box or its box has no move."""
         self._row = self.visible

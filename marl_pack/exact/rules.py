@@ -23,6 +23,7 @@ import numpy as np
 
 from marl_pack.exact.limits import (
     AREA_RATIO,
+    CARRIES,
     EQUILIBRIUM,
     HULL_1,
     HULL_ALPHA,
@@ -79,13 +80,24 @@ def shared(boxes: Any, j: int, x: int, y: int, w: int, d: int) -> tuple[int, int
 
 
 @njit(cache=True, inline="always")
+def carried_by(boxes: Any, j: int, x: int, y: int, w: int, d: int) -> tuple[int, int, int, int]:
+    """Return the rectangle in which the top of box j can carry a footprint, as :func:`shared`."""
+    return (
+        max(boxes[j, CARRIES], x),
+        max(boxes[j, CARRIES + 1], y),
+        min(boxes[j, CARRIES + 2], x + w),
+        min(boxes[j, CARRIES + 3], y + d),
+    )
+
+
+@njit(cache=True, inline="always")
 def find_contacts(
     boxes: Any, n: int, x: int, y: int, z: int, w: int, d: int, tolerance: int, touching: Any
 ) -> int:
     """Find the boxes whose tops support a footprint at height ``z``; return their number.
 
     Args:
-        boxes: int32 [≥ n, 6], rows x, y, z, w, d, h.
+        boxes: int32 [≥ n, 10], rows of :class:`marl_pack.exact.state.State`.
         n: number of boxes.
         x, y, z: low corner of the placed box.
         w, d: sides of its footprint.
@@ -96,7 +108,7 @@ def find_contacts(
     for j in range(n):
         gap = z - boxes[j, 2] - boxes[j, 5]
         if 0 <= gap <= tolerance:
-            x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
+            x0, y0, x1, y1 = carried_by(boxes, j, x, y, w, d)
             if x0 < x1 and y0 < y1:
                 touching[k] = j
                 k += 1
@@ -112,7 +124,7 @@ def gather(
 
     Args:
         rule: HULL_1, HULL_ALPHA or LBCP.
-        boxes: int32 [C, 6].
+        boxes: int32 [C, 10].
         starts: int64 [C + 1], first row of each box in ``parts``.
         parts: int32 [R, 4], of hull_alpha and equilibrium: rectangles x0, y0, x1, y1 in units; of
             lbcp: corners x, y of polygons in lattice points.
@@ -127,7 +139,7 @@ def gather(
     points = scratch.points
     for t in range(k):
         j = scratch.touching[t]
-        x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
+        x0, y0, x1, y1 = carried_by(boxes, j, x, y, w, d)
         if rule == HULL_1:
             n = add_rectangle(x0 * SCALE, y0 * SCALE, x1 * SCALE, y1 * SCALE, points, n)
             pieces += 1
@@ -187,7 +199,7 @@ def _area_ratio(
     """Return whether enough area and corners of a footprint are supported (Zhao et al. 2021)."""
     area, corners = 0, 0
     for t in range(k):
-        x0, y0, x1, y1 = shared(boxes, touching[t], x, y, w, d)
+        x0, y0, x1, y1 = carried_by(boxes, touching[t], x, y, w, d)
         area += (x1 - x0) * (y1 - y0)
         corners += (int(x0 == x) + int(x1 == x + w)) * (int(y0 == y) + int(y1 == y + d))
     for top, bottom, least in limits.thresholds:
@@ -206,7 +218,7 @@ def _within_overhang(
         return True
     low_x, low_y, high_x, high_y = x + w, y + d, x, y
     for t in range(k):
-        x0, y0, x1, y1 = shared(boxes, touching[t], x, y, w, d)
+        x0, y0, x1, y1 = carried_by(boxes, touching[t], x, y, w, d)
         low_x, low_y = min(low_x, x0), min(low_y, y0)
         high_x, high_y = max(high_x, x1), max(high_y, y1)
     beyond_x, beyond_y = max(low_x - x, x + w - high_x), max(low_y - y, y + d - high_y)
@@ -256,13 +268,14 @@ def carrying_part(
     Args:
         rule, boxes, starts, parts, scratch, k: the arguments of :func:`gather`, for the stack
             without the new box.
-        new: whole numbers [6], x, y, z, w, d, h of the new box.
+        new: whole numbers [10], the row of the new box.
         rows: int64 [≥ P, 4], written: the rows of the new box in ``parts``.
 
     Returns:
         The number of rows; 0 if nothing can rest on the box, or the rule keeps no parts.
     """
-    x, y, z, w, d, _ = new
+    z, x, y = new[2], new[CARRIES], new[CARRIES + 1]
+    w, d = new[CARRIES + 2] - x, new[CARRIES + 3] - y
     if rule == LBCP:
         if z == 0:
             n = add_rectangle(0, 0, w * SCALE, d * SCALE, scratch.points, 0)
@@ -282,7 +295,7 @@ def carrying_part(
     m, area = 0, 0
     for t in range(k):
         j = scratch.touching[t]
-        x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
+        x0, y0, x1, y1 = carried_by(boxes, j, x, y, w, d)
         for r in range(starts[j], starts[j + 1]):
             a0, b0 = max(x0, parts[r, 0]), max(y0, parts[r, 1])
             a1, b1 = min(x1, parts[r, 2]), min(y1, parts[r, 3])

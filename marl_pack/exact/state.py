@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marl_pack.exact.limits import EQUILIBRIUM, HULL_ALPHA, LBCP, Limits
+from marl_pack.exact.limits import CARRIES, EQUILIBRIUM, HULL_ALPHA, LBCP, ROW, Limits
 from marl_pack.exact.rules import carrying_part, find_contacts, make_scratch
 from marl_pack.installation import njit
 
@@ -22,7 +22,7 @@ PART_ROWS = 6
 class State(NamedTuple):
     """Arrays of B bins, as compiled code reads them."""
 
-    boxes: Any  # int32 [B, C, 6]     rows x, y, z, w, d, h in order of placement
+    boxes: Any  # int32 [B, C, 10]    rows in order of placement (marl_pack.exact.limits.ROW)
     count: Any  # int64 [B]           number of boxes
     weights: Any  # float64 [B, C]    weight of each box; an assumed one where it is unknown
     known: Any  # bool [B, C]         whether the weight is known
@@ -52,7 +52,7 @@ def empty_state(bins: int, capacity: int, keeps_parts: bool) -> State:
     b, c = bins, capacity
     rows = PART_ROWS * c if keeps_parts else 0
     return State(
-        np.zeros((b, c, 6), np.int32), np.zeros(b, np.int64), np.zeros((b, c)),
+        np.zeros((b, c, ROW), np.int32), np.zeros(b, np.int64), np.zeros((b, c)),
         np.zeros((b, c), np.bool_), np.ones((b, c), np.bool_), np.full((b, c), np.inf),
         np.zeros((b, c)), np.zeros((b, c, (c + 63) // 64), np.uint64), np.zeros((b, c), np.bool_),
         np.zeros((b, c + 1), np.int64), np.zeros((b, rows, 4), np.int32),
@@ -75,7 +75,7 @@ def add_box(
         limits: the rule, and its level tolerance.
         state: the bins, changed in place.
         b: number of the bin.
-        new: whole numbers [6], x, y, z, w, d, h.
+        new: whole numbers [10], the row of the box.
         weight, known, stackable, max_load: as in :class:`State`.
 
     Returns:
@@ -83,7 +83,8 @@ def add_box(
     """
     boxes, n, starts, parts = state.boxes[b], state.count[b], state.starts[b], state.parts[b]
     scratch = make_scratch(n, starts[n])
-    x, y, z, w, d, _ = new
+    z, x, y = new[2], new[CARRIES], new[CARRIES + 1]
+    w, d = new[CARRIES + 2] - x, new[CARRIES + 3] - y
     k = find_contacts(boxes, n, x, y, z, w, d, limits.tolerance, scratch.touching)
     rows = np.empty((scratch.points.shape[0], 4), np.int64)
     size = carrying_part(limits.rule, boxes, starts, parts, scratch, k, new, rows)
@@ -93,7 +94,7 @@ def add_box(
     width = 2 if limits.rule == LBCP else 4
     parts[starts[n] : needed, :width] = rows[:size, :width]
     starts[n + 1] = needed
-    for i in range(6):
+    for i in range(ROW):
         boxes[n, i] = new[i]
     grounded = limits.rule in (HULL_ALPHA, EQUILIBRIUM) and size == 1 and (
         rows[0, 2] - rows[0, 0]) * (rows[0, 3] - rows[0, 1]) == w * d  # fmt: skip

@@ -36,7 +36,8 @@ class Stack:
     low: Floats  # [n, 3]    low corner of each box, m
     sides: Floats  # [n, 3]  m
     mass: Floats  # [n]      kg
-    com: Floats  # [n, 3]    centre of mass from the box's middle, m
+    com: Floats  # [n, 3]    centre of mass from the box's middle, m, along its own sides
+    yaw: Floats  # [n]       rotation about the vertical through the middle, radians
 
     @classmethod
     def of_cells(
@@ -48,6 +49,7 @@ class Stack:
         density: ArrayLike | None = None,
         mass: ArrayLike | None = None,
         com_offset: ArrayLike = (0.0, 0.0, 0.0),
+        yaw: ArrayLike = 0.0,
     ) -> Stack:
         """Return the stack of boxes given in cells.
 
@@ -60,6 +62,8 @@ class Stack:
             mass: mass in kg, one for all boxes or [n].
             com_offset: centre of mass from the box's middle in fractions of w, d, h, one for all
                 boxes or [n, 3], each strictly between -0.5 and 0.5.
+            yaw: rotation about the vertical through the middle in degrees, one for all boxes or
+                [n]; the rows are then those of the boxes before they are rotated.
 
         Raises:
             ValueError: if boxes overlap, float, reach out of the bin or have a side that is not
@@ -88,7 +92,9 @@ class Stack:
         _refuse(~inside, offset, "needs a centre of mass inside the box")
         with np.errstate(over="ignore"):
             weights = weights * sides.prod(1) if mass is None else weights
-        stack = cls(inner * cell, low, sides, weights, offset * sides)
+        yaws = np.radians(_each(yaw, len(rows), (), "yaw"))
+        _refuse(~np.isfinite(yaws), rows, "needs a finite yaw")
+        stack = cls(inner * cell, low, sides, weights, offset * sides, yaws)
         stack.check(rows)
         _refuse(~(np.isfinite(weights) & (weights > 0)), rows, "its mass is not a number > 0")
         return stack
@@ -123,7 +129,7 @@ class Stack:
         return cls.of_cells(
             plan.bin_sizes[0].tolist(), plan.boxes, cell=cell_of(plan) if cell is None else cell,
             density=density, mass=mass,
-            com_offset=offsets_of(plan) if com_offset is None else com_offset,
+            com_offset=offsets_of(plan) if com_offset is None else com_offset, yaw=plan.yaws,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -143,7 +149,7 @@ class Stack:
         """Return the stack with lengths times ``scale`` and a mean mass of 1 kg."""
         lengths = (self.size, self.low, self.sides, self.com)
         size, low, sides, com = (length * scale for length in lengths)
-        return Stack(size, low, sides, self.mass / self.mass.mean(), com)
+        return Stack(size, low, sides, self.mass / self.mass.mean(), com, self.yaw)
 
     def first(self, count: int) -> Stack:
         """Return the stack as it was when ``count`` boxes had been placed."""
@@ -165,7 +171,28 @@ class Stack:
         """Return, bool [n, n], whether box i touches box j from above on more than an edge."""
         low, high = self.low, self.high
         meet = np.abs(low[:, None, 2] - high[None, :, 2]) < self.slack
-        return meet & (overlaps(low, high)[..., :2] > self.slack).all(-1)
+        return meet & (self.overlaps()[0] > self.slack)
+
+    def overlaps(self) -> tuple[Floats, Floats]:
+        """Return how far boxes i and j overlap, seen from above and vertically, [n, n] each.
+
+        A negative number is a gap. Seen from above it is the least overlap along a side of one of
+        the two (separating axis theorem).
+        """
+        low, high = self.low, self.high
+        along = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
+        if not self.yaw.any():
+            return along[..., :2].min(-1), along[..., 2]
+        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
+        axes = np.stack((np.stack((cos, sin), -1), np.stack((-sin, cos), -1)), 1)  # [n, 2, 2]
+        half, middle = self.sides[:, :2] / 2, self.middle[:, :2]
+        apart = middle[None] - middle[:, None]  # [i, j]
+        # Along the sides of box i: both half lengths minus the distance of the middles.
+        reach = np.einsum("iax,jbx->ijab", axes, axes)
+        other = (np.abs(reach) * half[None, :, None]).sum(-1)
+        depth = half[:, None] + other - np.abs(np.einsum("iax,ijx->ija", axes, apart))
+        least = depth.min(-1)
+        return np.minimum(least, least.T), along[..., 2]
 
     def check(self, named: NDArray[np.floating[Any]] | None = None) -> None:
         """Refuse a stack that cannot exist.
@@ -184,9 +211,15 @@ class Stack:
             ~np.isfinite(np.hstack([self.low, self.sides])).all(1), rows, "needs finite numbers"
         )
         _refuse((self.sides <= 0).any(1), rows, "needs sides longer than 0")
-        out = (self.low < -self.slack) | (self.high > self.size + self.slack)
+        cos, sin = np.abs(np.cos(self.yaw)), np.abs(np.sin(self.yaw))
+        w, d = self.sides[:, 0], self.sides[:, 1]
+        wide = np.column_stack((w * cos + d * sin, w * sin + d * cos, self.sides[:, 2]))
+        out = (self.middle - wide / 2 < -self.slack) | (
+            self.middle + wide / 2 > self.size + self.slack
+        )
         _refuse(out.any(1), rows, "reaches out of the bin")
-        shared = np.tril((overlaps(self.low, self.high) > self.slack).all(-1), -1)
+        beside, above = self.overlaps()
+        shared = np.tril((beside > self.slack) & (above > self.slack), -1)
         for i, j in np.argwhere(shared)[:1]:
             raise ValueError(f"{_name(i, rows)} overlaps {_name(j, rows)}")
         resting = np.tril(self.rests_on(), -1).any(1) | (self.low[:, 2] < self.slack)
@@ -211,11 +244,6 @@ def offsets_of(plan: Plan) -> Floats:
     offset = np.zeros((len(plan), 3))
     offset[:, :2] = (plan.centres - plan.positions[:, :2]) / plan.sides[:, :2] - 0.5
     return offset
-
-
-def overlaps(low: Floats, high: Floats) -> Floats:
-    """Return the length that boxes i and j share on each axis, [n, n, 3]; negative for a gap."""
-    return np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
 
 
 def _each(value: ArrayLike | None, n: int, shape: tuple[int, ...], name: str) -> Floats:

@@ -261,7 +261,7 @@ class _Run:
         plan, trial = self.plan, self.trial
         inserted = self.world.inserted
         under = plan.high[inserted, 2] < plan.low[i, 2] + plan.slack
-        yaw = float(self.errors.yaw[i])
+        yaw = float(plan.yaw[i] + self.errors.yaw[i])
         descent = Descent(
             self.world.boxes.sides[i] / 2, yaw, plan.middle[i, :2] + self.errors.shift[i],
             plan.middle[i], trial.drop, trial.give, trial.distance,
@@ -275,7 +275,9 @@ class _Run:
     def _collapsed(self) -> bool:
         """Return whether a box is too far from its planned pose, and record which and how far."""
         inserted = np.array(self.world.inserted)
-        distance, angle = movement(*self.world.poses(), self.plan.middle[inserted])
+        distance, angle = movement(
+            *self.world.poses(), self.plan.middle[inserted], self.plan.yaw[inserted]
+        )
         self.distance = max(self.distance, float(distance.max()))
         self.angle = max(self.angle, float(angle.max()))
         self.off = tuple(inserted[list(past(distance, angle, self.physics))].tolist())

@@ -6,6 +6,7 @@ SAPIEN is loaded when the first world is built, so that importing this module ne
 from __future__ import annotations
 
 import functools
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from marl_pack.extras import missing
-from marl_pack.sapien_check.stack import Floats, Stack, overlaps
+from marl_pack.sapien_check.stack import Floats, Stack
 
 GROUND_BIT = 31  # the bit of the collision groups that stands for the floor
 WALL = 0.05  # metres, thickness of the walls
@@ -128,11 +129,12 @@ class World:
         body.attach(shape)
         self._add(body, middle)
 
-    def _add(self, body: Any, middle: Sequence[float]) -> None:
-        """Add a body to the scene with its middle at a point."""
+    def _add(self, body: Any, middle: Sequence[float], yaw: float = 0.0) -> None:
+        """Add a body to the scene with its middle at a point, rotated about the vertical."""
         entity = self.sapien.Entity()
         entity.add_component(body)
-        entity.set_pose(self.sapien.Pose(list(middle)))
+        rotation = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+        entity.set_pose(self.sapien.Pose(list(middle), rotation))
         self.scene.add_entity(entity)
 
     def add_box(self, stack: Stack, i: int, groups: list[int]) -> Any:
@@ -149,7 +151,7 @@ class World:
         body.set_inertia((mass / 12 * (square.sum() - square)).astype(np.float32))
         body.set_linear_damping(0.0)
         body.set_angular_damping(0.0)
-        self._add(body, stack.middle[i].tolist())
+        self._add(body, stack.middle[i].tolist(), float(stack.yaw[i]))
         self.bodies.append(body)
         return body
 
@@ -184,23 +186,28 @@ class World:
         Raises:
             SimulationError: for the reasons of :meth:`poses`.
         """
-        return movement(*self.poses(), self.stack.middle)
+        return movement(*self.poses(), self.stack.middle, self.stack.yaw)
 
     def moved(self) -> tuple[int, ...]:
         """Return the boxes that moved by more than a threshold."""
         return past(*self.movement(), self.physics)
 
 
-def movement(middles: Floats, rotations: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+def movement(
+    middles: Floats, rotations: Floats, nominal: Floats, yaw: Floats
+) -> tuple[Floats, Floats]:
     """Return how far boxes are from their nominal poses: their middles in metres, and degrees, [n].
 
     Args:
         middles: [n, 3], metres.
-        rotations: quaternions [n, 4], w first; a nominal pose has no rotation.
+        rotations: quaternions [n, 4], w first.
         nominal: [n, 3], middles of the nominal poses.
+        yaw: [n], their rotations about the vertical, radians.
     """
     # The vector part's length is the sine of half the angle: exact for small angles.
-    vector = np.linalg.norm(rotations[:, 1:], axis=1)
+    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
+    w, x, y, z = rotations.T
+    vector = np.sqrt((x * cos + y * sin) ** 2 + (y * cos - x * sin) ** 2 + (z * cos - w * sin) ** 2)
     distance = np.linalg.norm(middles - nominal, axis=1)
     return distance, np.degrees(2 * np.arcsin(vector.clip(max=1.0)))
 
@@ -235,8 +242,8 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
         return [EVERY] * n
     on = stack.rests_on()
     near = 2 * (physics.distance + physics.contact_offset)  # both boxes may come closer
-    gap = -overlaps(stack.low, stack.high)
-    stray = (gap < near).all(-1) & ~on  # [i, j]: i could touch j later, but does not rest on it
+    beside, above = stack.overlaps()
+    stray = (-beside < near) & (-above < near) & ~on  # [i, j]: i could touch j later, but does not rest on it
     np.fill_diagonal(stray, False)
     # j and k may not share a bit if something on j could touch k without resting on it.
     apart = (on.T.astype(np.float32) @ stray.astype(np.float32)) > 0
