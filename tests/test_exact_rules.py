@@ -36,7 +36,7 @@ def bins_with(boxes: Any, spec: ExactSpec, **attributes: Any) -> ExactBins:
     sides = np.array(boxes, np.float64)[:, 3:] * spec.unit_mm
     everything = goods(sides, spec, **attributes)
     for i, box in enumerate(np.array(boxes, np.int64)):
-        bins._add(box[None], everything[i : i + 1], ALWAYS)
+        bins.add(box[None], everything[i : i + 1], ALWAYS)
     return bins
 
 
@@ -315,7 +315,7 @@ def copied(game: Packing, spec: ExactSpec) -> tuple[ExactBins, Goods]:
         )  # fmt: skip
 
     for k in range(int(count.max())):
-        bins._add(boxes[:, k], record(np.maximum(boxes[:, k, 3:], 1)), count > k)
+        bins.add(boxes[:, k], record(np.maximum(boxes[:, k, 3:], 1)), count > k)
     return bins, record(game.items.sides.numpy().astype(np.int64))
 
 

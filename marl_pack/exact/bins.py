@@ -176,7 +176,7 @@ class ExactBins:
         self.state = empty_state(1, spec.max_boxes, keeps_parts(self.limits.rule))
         if present is not None:
             for k in range(len(present.rows)):
-                self._add(present.rows[[k]], present.goods[[k]], np.ones(1, np.bool_))
+                self.add(present.rows[[k]], present.goods[[k]], np.ones(1, np.bool_))
         self._first = self.state
         self.state = self.state.at(np.zeros(n, np.int64))
 
@@ -256,8 +256,7 @@ class ExactBins:
         if not self._open(weights, known, np.arange(len(self)) == b)[b]:
             return np.empty(0, np.int64)
         state, n = self.state, self.state.count[b]
-        blocked = np.zeros(self.spec.max_boxes, np.bool_)
-        blocked_boxes(state, b, weights[b], known[b], blocked)
+        blocked = self.blocked(b, items[[b]])
         out, verdicts = np.empty(6 * len(corners), np.int64), np.empty(6 * len(corners), np.uint8)
         total = moves_at(
             self.limits, self.size, state.boxes[b], n, state.starts[b], state.parts[b], blocked,
@@ -440,10 +439,10 @@ class ExactBins:
         chosen = moves >= 0
         where = placements(np.maximum(moves, 0))
         sides = np.take_along_axis(items.sides, AXES[where[:, 0]], 1)
-        self._add(np.hstack((where[:, 1:], sides)), items, chosen)
+        self.add(np.hstack((where[:, 1:], sides)), items, chosen)
 
-    def _add(self, rows: NDArray[np.int64], items: Goods, chosen: NDArray[np.bool_]) -> None:
-        """Add a box to each chosen bin; rows of carrying parts grow when they have to.
+    def add(self, rows: NDArray[np.int64], items: Goods, chosen: NDArray[np.bool_]) -> None:
+        """Add a box to each chosen bin at a row that is not checked.
 
         Args:
             rows: int64 [B, 6], x, y, z, w, d, h; or [B, 10], rows of the state.
@@ -466,6 +465,16 @@ class ExactBins:
             more = np.zeros((len(self), max(needed, 2 * parts.shape[1]), 4), np.int32)
             more[:, : parts.shape[1]] = parts
             self.state = self.state._replace(parts=more)
+
+    def blocked(self, b: int, item: Goods) -> NDArray[np.bool_]:
+        """Return on which boxes of bin ``b`` an item, one row, may not rest, bool [C].
+
+        The reasons are the limits of goods: a box is not stackable, or would carry too much.
+        """
+        weights, known = self.weights_of(item)
+        blocked = np.zeros(self.spec.max_boxes, np.bool_)
+        blocked_boxes(self.state, b, weights[0], known[0], blocked)
+        return blocked
 
     def _refuse_full(self, chosen: NDArray[np.bool_]) -> None:
         """Raise ValueError if a chosen bin has no memory for one more box."""

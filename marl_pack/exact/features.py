@@ -153,16 +153,18 @@ def describe_contacts(
     w, d, h = item[AXES[o, 0]], item[AXES[o, 1]], item[AXES[o, 2]]
     surface = 2.0 * (float(w) * d + float(w) * h + float(d) * h)
     bottom = float(w) * d if z == 0 else 0.0
-    sides, level = 0.0, 0.0
+    sides, level = 0.0, 0
     walls = float(d) * h * (int(x <= near) + int(x + w >= W - near))
     walls += float(w) * h * (int(y <= near) + int(y + d >= D - near))
     low_x, high_x, low_y, high_y = x, W - x - w, y, D - y - d  # distances to the nearest faces
     for j in range(n):
+        low, high = boxes[j, 2], boxes[j, 2] + boxes[j, 5]
+        if high < z - limits.tolerance:  # all others are lower still
+            break
         x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
         along_x, along_y = x1 - x0, y1 - y0
         if along_x <= 0 and along_y <= 0:
             continue
-        low, high = boxes[j, 2], boxes[j, 2] + boxes[j, 5]
         if along_x > 0 and along_y > 0:
             if high <= z and z - high <= limits.tolerance:
                 bottom += float(along_x) * along_y
@@ -185,9 +187,9 @@ def describe_contacts(
         if gap <= near:
             sides += length * tall
             if abs(high - z - h) <= limits.tolerance:
-                level += along / (2.0 * (w + d))
+                level += along
     out[BOTTOM], out[SIDES], out[WALLS] = bottom / surface, sides / surface, walls / surface
-    out[LEVEL] = level
+    out[LEVEL] = level / (2.0 * (w + d))
     out[GAP_X] = _narrow(low_x, w, near) + _narrow(high_x, w, near)
     out[GAP_Y] = _narrow(low_y, d, near) + _narrow(high_y, d, near)
 
@@ -201,7 +203,7 @@ def describe(
     Args:
         limits: clearance and level tolerance.
         size: int64 [3], W, D, H.
-        boxes: int32 [C, 10].
+        boxes: int32 [C, 10], the highest top first (:func:`marl_pack.exact.moves.by_top`).
         n: number of boxes.
         item: int64 [3], the item's own sides.
         move: the move.

@@ -69,10 +69,35 @@ class Goods:
         unit = columns.pop("unit_mm")
         return type(self)(**{name: column[index] for name, column in columns.items()}, unit_mm=unit)
 
+    def same(self, other: Goods) -> bool:
+        """Return whether the rows are equal, attributes included."""
+        return all(
+            np.array_equal(
+                getattr(self, f.name), getattr(other, f.name), equal_nan=f.name == "weights"
+            )
+            for f in fields(self)
+        )
+
     @property
     def volumes(self) -> NDArray[np.float64]:
         """Volume of each box in cubic units, float64 [R]."""
         return self.sides.astype(np.float64).prod(-1)
+
+
+def joined(parts: Sequence[Goods], unit_mm: float) -> Goods:
+    """Return the rows of several goods in one record; all have the same unit."""
+    names = [f.name for f in fields(Goods) if f.name != "unit_mm"]
+    shapes: dict[str, Any] = {
+        "sides": np.empty((0, 3), np.int64), "orientations": np.empty((0, 6), np.bool_),
+        "stackable": np.empty(0, np.bool_), "ids": np.empty(0, object),
+    }  # fmt: skip
+    columns = {
+        name: np.concatenate([
+            shapes.get(name, np.empty(0)), *(getattr(part, name) for part in parts)
+        ])
+        for name in names
+    }  # fmt: skip
+    return Goods(**columns, unit_mm=unit_mm)
 
 
 def check_goods(
@@ -124,7 +149,7 @@ def check_goods(
         unit_mm=spec.unit_mm,
     )
     if fit:
-        goods = _fitting(goods, spec, rows, source)
+        goods = fitting(goods, spec, rows, source)
     quantity = values.get("quantity")
     if quantity is None:
         return goods
@@ -155,7 +180,7 @@ def number_rows(values: Any, width: int, source: str, what: str) -> NDArray[np.f
     return decimals(rows)
 
 
-def _fitting(goods: Goods, spec: ExactSpec, rows: NDArray[Any], source: str) -> Goods:
+def fitting(goods: Goods, spec: ExactSpec, rows: NDArray[Any], source: str) -> Goods:
     """Return goods with the orientations that the game allows; refuse those that cannot be placed.
 
     Args:
@@ -252,7 +277,7 @@ def goods_of(items: Any, spec: ExactSpec, source: str = "items") -> Goods:
                 f"{source}: goods in units of {items.unit_mm:g} mm; needs the game's unit_mm, "
                 f"{spec.unit_mm:g}"
             )
-        return _fitting(items, spec, to_mm(items.sides, spec.unit_mm), source)
+        return fitting(items, spec, to_mm(items.sides, spec.unit_mm), source)
     if isinstance(items, Mapping):
         check_names(items, ("items", *KEYS), ("items",), source, "key")
         rest = {key: value for key, value in items.items() if key != "items"}

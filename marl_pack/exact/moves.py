@@ -77,6 +77,31 @@ def _positions(
 
 
 @njit(cache=True)
+def _faces(
+    boxes: Any, n: int, axis: int, side: int, clearance: int, positions: Any, count: int, out: Any
+) -> None:
+    """Find at which positions along an axis a face may touch a box.
+
+    Args:
+        boxes, n, axis, side, clearance: as for :func:`_positions`.
+        positions: int64 [≥ count].
+        count: number of positions.
+        out: uint8 [≥ count], written: 1 if the low face is at most the clearance from the edge of a
+            box before it, plus 2 if the high face is from one behind it.
+    """
+    for i in range(count):
+        low, high = positions[i], positions[i] + side
+        flags = 0
+        for j in range(n):
+            start = boxes[j, axis]
+            if 0 <= low - start - boxes[j, 3 + axis] <= clearance:
+                flags |= 1
+            if 0 <= start - high <= clearance:
+                flags |= 2
+        out[i] = flags
+
+
+@njit(cache=True)
 def resting_height(boxes: Any, n: int, x: int, y: int, w: int, d: int, clearance: int) -> int:
     """Return the height at which a footprint rests; -1 if a neighbour is within the clearance."""
     z, tallest = 0, 0
@@ -105,39 +130,41 @@ def same_sides(item: Any, o: int, allowed: Any) -> bool:
 
 
 @njit(cache=True)
-def _by_top(boxes: Any, n: int) -> Any:
-    """Return the boxes' numbers, the highest top first, int64 [n]."""
+def by_top(boxes: Any, n: int) -> Any:
+    """Return the rows of n boxes, the highest top first, [n, 10]."""
     keys = np.empty(n, np.int64)
     for j in range(n):
-        keys[j] = ((boxes[j, 2] + boxes[j, 5]) << BITS) | j
+        keys[j] = (np.int64(boxes[j, 2] + boxes[j, 5]) << BITS) | j
     keys.sort()
-    order = np.empty(n, np.int64)
+    rows = np.empty((n, boxes.shape[1]), boxes.dtype)
     for j in range(n):
-        order[j] = keys[n - 1 - j] & MASK
-    return order
+        rows[j] = boxes[keys[n - 1 - j] & MASK]
+    return rows
 
 
 @njit(cache=True)
 def candidates(
-    limits: Limits, size: Any, boxes: Any, n: int, item: Any, allowed: Any, out: Any
+    limits: Limits, size: Any, boxes: Any, n: int, item: Any, allowed: Any, out: Any, faces: Any
 ) -> int:
     """List the event points at which a box fits into a bin, whether it stands there or not.
 
     Args:
         limits: clearance and level tolerance.
         size: int64 [3], W, D, H.
-        boxes: int32 [C, 10], rows of the state.
+        boxes: int32 [≥ n, 10], the highest top first (:func:`by_top`).
         n: number of boxes.
         item: int64 [3], the item's own sides w, d, h.
         allowed: bool [6], orientations it may be placed in.
         out: int64 [M], written: the moves in no order, as many as there is room for.
+        faces: uint8 [M], written: the faces of the box that may touch others, bits in the order of
+            low x, high x, low y, high y; or an empty array.
 
     Returns:
         The number of moves; if it is larger than M, ``out`` is incomplete.
     """
-    order = _by_top(boxes, n)
     xs, ys = np.empty(8 * n + 4, np.int64), np.empty(8 * n + 4, np.int64)
     strip = np.empty((n, 4), np.int64)  # low y, high y, top, whether it shares x with the footprint
+    faces_x, faces_y = np.zeros(8 * n + 4, np.uint8), np.zeros(8 * n + 4, np.uint8)
     gap = limits.clearance
     total = 0
     for o in range(6):
@@ -146,11 +173,13 @@ def candidates(
             continue
         n_x = _positions(boxes, n, 0, size[0], w, gap, xs)
         n_y = _positions(boxes, n, 1, size[1], d, gap, ys)
+        if faces.size:
+            _faces(boxes, n, 0, w, gap, xs, n_x, faces_x)
+            _faces(boxes, n, 1, d, gap, ys, n_y, faces_y)
         for i in range(n_x):
             x = xs[i]
             m = 0
-            for k in range(n):
-                j = order[k]
+            for j in range(n):
                 low = boxes[j, 0]
                 high = low + boxes[j, 3]
                 if low < x + w + gap and high > x - gap:
@@ -164,6 +193,8 @@ def candidates(
                 if 0 <= z <= size[2] - h:
                     if total < out.size:
                         out[total] = encode(o, x, ys[k], z)
+                        if faces.size:
+                            faces[total] = faces_x[i] | faces_y[k] << 2
                     total += 1
     return total
 
@@ -230,7 +261,8 @@ def list_moves(
     Returns:
         The number of moves; or, if ``out`` has no room for the candidates, minus the room needed.
     """
-    fitting = candidates(limits, size, boxes, n, item, allowed, out)
+    faces = np.empty(0, np.uint8)
+    fitting = candidates(limits, size, by_top(boxes, n), n, item, allowed, out, faces)
     if fitting > out.size:
         return -fitting
     scratch = make_scratch(n, starts[n])

@@ -31,6 +31,12 @@ if TYPE_CHECKING:
     from marl_pack.exact.packing import ExactPacking
 
 MILLISECOND = 1_000_000  # nanoseconds
+CERTAINTY = 1.0
+"""Standard errors by which a move has to be better than the one with the best score."""
+FEWEST = 3
+"""Futures that this needs at least."""
+SHARE = 8
+"""So many futures there should be time for, for each move that is tried."""
 
 
 @njit(cache=True)
@@ -131,14 +137,17 @@ class Search:
 
     def __post_init__(self) -> None:
         self.played = 0  # futures played so far
-        self.generator = np.random.default_rng(self.seed)
 
     def __call__(self, game: ExactPacking) -> NDArray[np.int64]:
         """Return the move of each game, int64 [G]; NOWHERE where the box has no place."""
         moves = np.full(len(game.bins), NOWHERE)
         for g in np.flatnonzero(game.alive).tolist():
             begin = self.clock()
-            moves[g] = self._choose(game.bins.select([g]), game.items[[g]], game.shown(g), begin)
+            shown = game.shown(g)
+            generator = np.random.default_rng((self.seed, int(game.episode[g]), len(shown)))
+            moves[g] = self._choose(
+                game.bins.select([g]), game.items[[g]], shown, generator, begin
+            )
         return moves
 
     def ranked(self, bins: ExactBins, item: Goods) -> NDArray[np.int64]:
@@ -147,7 +156,10 @@ class Search:
         scores = bins.features(0, item.sides[0], moves) @ self.weights
         return moves[np.lexsort((moves, -scores))[: self.settings.top]]
 
-    def _choose(self, bins: ExactBins, item: Goods, shown: Goods, begin: int) -> int:
+    def _choose(
+        self, bins: ExactBins, item: Goods, shown: Goods, generator: np.random.Generator,
+        begin: int,
+    ) -> int:  # fmt: skip
         """Return the best move of an item in the only bin."""
         moves = self.ranked(bins, item)
         if len(moves) < 2:
@@ -156,25 +168,57 @@ class Search:
         if not room:
             return int(moves[0])
         trial = _Trial(self.weights, bins, item, moves)
+        end = begin + int(self.settings.budget_ms * MILLISECOND)
+
+        def draw() -> tuple[Goods, NDArray[np.int64]]:
+            return self.futures.draw(generator, item, shown, room)
+
+        future, started = draw(), self.clock()
+        value = trial.value(0, *future)
+        cost = max(1, self.clock() - started)
+        if self.settings.futures is None:  # as many moves as there is time for
+            affordable = (end - self.clock()) // (cost * SHARE)
+            moves = moves[: max(2, min(len(moves), affordable))]
+        values = np.empty((0, len(moves)))  # [futures, moves]; NaN: not tried
         survivors = np.arange(len(moves))
-        totals, count = np.zeros(len(moves)), 0
         rounds = math.ceil(math.log2(len(moves)))
         for k in range(rounds):
-            deadline = begin + self.settings.budget_ms * MILLISECOND * (k + 1) / rounds
+            deadline = begin + (end - begin) * (k + 1) // rounds
             tries = self.settings.tries(k, rounds, len(survivors))
-            while True:
-                goods, rows = self.futures.draw(self.generator, item, shown, room)
-                for m in survivors.tolist():
-                    totals[m] += trial.value(m, goods, rows)
-                self.played += len(survivors)
-                count += 1
-                tries -= 1
-                if tries <= 0 or self.clock() >= deadline:
+            played = 0
+            while played < tries and self.clock() < deadline:
+                row = np.full(len(moves), np.nan)
+                if len(values):
+                    future = draw()
+                    row[survivors[0]] = trial.value(int(survivors[0]), *future)
+                else:
+                    row[0] = value
+                for m in survivors[1:].tolist():
+                    if self.clock() >= end:
+                        break
+                    row[m] = trial.value(m, *future)
+                if np.isnan(row[survivors]).any():  # the time is over: the future is not complete
                     break
-            # Totals are of the same futures. A stable sort keeps the better score first.
-            order = np.argsort(-totals[survivors], kind="stable")
+                values = np.vstack((values, row))
+                played += 1
+            self.played += played * len(survivors)
+            # Survivors were tried in all futures. A stable sort keeps the better score first.
+            means = values[:, survivors].mean(0) if len(values) else np.zeros(len(survivors))
+            order = np.argsort(-means, kind="stable")
             survivors = np.sort(survivors[order[: -(-len(survivors) // 2)]])
-        return int(moves[survivors[0]])
+        return int(moves[self._better(int(survivors[0]), values)])
+
+    def _better(self, m: int, values: NDArray[np.float64]) -> int:
+        """Return move ``m`` if the futures show that it is better than the first one, else 0.
+
+        It has to be better by :data:`CERTAINTY` standard errors, in the futures that both had.
+        """
+        gains = values[:, m] - values[:, 0]
+        gains = gains[~np.isnan(gains)]
+        if len(gains) < FEWEST:
+            return 0
+        error = gains.std(ddof=1) / math.sqrt(len(gains))
+        return m if gains.mean() > CERTAINTY * error else 0
 
 
 class _Trial:

@@ -19,14 +19,15 @@ class ExactSearchSettings:
     Args:
         budget_ms: milliseconds for a decision. The search stops after the future in which they end;
             listing the moves is counted.
-        top: number M of moves to try, the best ones by the linear score.
+        top: number M of moves to try, the best ones by the linear score; fewer if there is too
+            little time for so many.
         futures: number K of futures for each move, on average; the search ends earlier when they
             are played. None: as many as there is time for. With a number and a long time, the
             search does not depend on the speed of the machine.
     """
 
     budget_ms: float = 500.0
-    top: int = 8
+    top: int = 16
     futures: int | None = None
 
     def __post_init__(self) -> None:

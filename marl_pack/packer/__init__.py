@@ -1,0 +1,1 @@
+"""The packer: boxes in, poses out, in millimetres."""

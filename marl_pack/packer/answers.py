@@ -1,0 +1,69 @@
+"""What the packer answers: a placement, or no place and why."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a box is placed. Lengths are in millimetres; it is true in a condition."""
+
+    id: str  # "" where unknown
+    bin: int  # number of the bin, from 0
+    orientation: int  # row of marl_pack.geometry.ORIENTATIONS
+    x: float  # low corner in the bin
+    y: float
+    z: float
+    w: float  # sides along x, y, z, as placed
+    d: float
+    h: float
+    centre: tuple[float, float, float]  # middle of the box in the bin
+    support: float  # share of the footprint that rests on the floor or on boxes, 0 … 1
+    margin: float  # distance of the centre of mass from the edge of its support
+    yaw: float = 0.0  # rotation about the vertical, degrees; only if the robot reported it
+    problem: str = ""  # why a reported pose breaks the rule; "" if it does not
+
+    placed: Literal[True] = True
+
+    def __bool__(self) -> bool:
+        return True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the placement for JSON; yaw and problem only where a pose was reported."""
+        values = asdict(self)
+        if not self.yaw and not self.problem:
+            del values["yaw"], values["problem"]
+        return {"placed": values.pop("placed"), **values}
+
+
+@dataclass(frozen=True)
+class NoPlace:
+    """A box has no place, and why; it is false in a condition."""
+
+    id: str
+    code: str  # a key of REASONS
+    reason: str  # one sentence
+
+    placed: Literal[False] = False
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer for JSON."""
+        return {"placed": False, "id": self.id, "code": self.code, "reason": self.reason}
+
+
+REASONS = {
+    "too_large": "larger than the empty bin in every orientation that it may take",
+    "too_heavy": "the bin would become heavier than it may be",
+    "unknown_weight": "the bin has a weight limit, and a weight is unknown",
+    "full": "the bin holds as many boxes as it may",
+    "no_space": "it fits nowhere between the boxes",
+    "too_tall": "it would reach above the bin wherever it fits",
+    "no_support": "nowhere would it stand by the rule and the margin",
+    "load": "it would have to rest on boxes that may not carry it",
+}
+"""The reasons why a box has no place, by their code."""

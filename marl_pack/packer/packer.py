@@ -1,0 +1,489 @@
+"""Pack boxes one by one, in millimetres: :class:`Packer`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_pack.checks import LARGEST_SEED, shown, whole_number
+from marl_pack.exact.bins import ExactBins, placements
+from marl_pack.exact.goods import AXES, Goods, fitting, joined
+from marl_pack.exact.lengths import to_mm
+from marl_pack.exact.limits import ROW
+from marl_pack.exact.present import Present, check_present
+from marl_pack.exact.spec import ExactSpec
+from marl_pack.exact.support import Support, measure
+from marl_pack.files import write_json
+from marl_pack.inputs import read_json
+from marl_pack.option_record import document
+from marl_pack.packer import calls
+from marl_pack.packer.answers import NoPlace, Placement
+from marl_pack.packer.calls import Call, Opened, Placed, Reported, Skipped
+from marl_pack.packer.policies import PackerPolicy, make_packer_policy
+from marl_pack.packer.poses import Pose, overlap, rectangles
+from marl_pack.packer.reasons import why_not
+from marl_pack.packer.turn import Turn
+from marl_pack.plan import LeftOut, Plan
+
+TOUCHING = 0.5
+"""Units by which reported poses may overlap: they are rounded to whole units."""
+MOST_BINS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A box in a bin, in units."""
+
+    item: Goods  # one row
+    placement: Placement
+    row: NDArray[np.int64]  # [10]  its row in the bin's state
+    middle: tuple[float, float]  # x, y
+
+
+@dataclass(frozen=True)
+class PackerState:
+    """What the packer has done so far."""
+
+    bins: int  # number of bins opened, the open one included
+    boxes: tuple[int, ...]  # number of boxes in each bin
+    utilization: tuple[float, ...]  # share of each bin's volume that is filled
+    weight: tuple[float, ...]  # known weights in each bin, kilograms
+    left_out: tuple[LeftOut, ...]  # boxes that were skipped
+    least_margin: float | None  # smallest margin of a box that rests on others, mm
+
+
+@document(ExactSpec, " " * 8)
+class Packer:
+    """Pack boxes as they come: boxes in, poses out, in millimetres.
+
+    One bin is open. A box gets the place that the policy chooses among those that the rule allows.
+
+    Attributes:
+        spec: the options of the bins and of the rule.
+        placements: the placements so far, in order.
+        left_out: the boxes that were skipped, with the reasons.
+
+    Args:
+        bin_mm: inner sides W, D, H of a bin in millimetres; an option, as below.
+        policy: a heuristic (``max_contact``, ``linear``, …), ``"search"``, a .json file of
+            ``marl-pack tune``, a published model such as ``"rs"``, a run's folder or a checkpoint,
+            or a function (:class:`marl_pack.exact.policies.ExactPolicy`).
+        spec: the options; by default ``ExactSpec()``.
+        bins: largest number of bins. With more than one, the next bin is opened when a box has no
+            place in the open one; None for any number.
+        present: boxes that are in the first bin already
+            (:func:`marl_pack.exact.present.check_present`).
+        plan: settings of the policy ``search``, such as ``"budget=500ms"``.
+        catalogue: goods from which the search draws the boxes to come, a file or as for
+            :class:`marl_pack.exact.packing.ExactPacking`; by default what was shown so far.
+        grid_mm: edge of the cells on which agents trained on cells see the bin.
+        seed: seed of ``random`` and ``search``.
+        **options: options that replace those in ``spec``:
+        {options}
+
+    Raises:
+        ValueError, FileNotFoundError: if an argument is impossible; says what would be right.
+    """
+
+    def __init__(
+        self,
+        bin_mm: Sequence[float] | None = None,
+        policy: str | Path | Callable[[Any], Any] = "max_contact",
+        *,
+        spec: ExactSpec | None = None,
+        bins: int | None = 1,
+        present: Any = (),
+        plan: Any = None,
+        catalogue: Any = None,
+        grid_mm: float | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        if not (spec is None or isinstance(spec, ExactSpec)):
+            raise ValueError(f"spec = {shown(spec)}: needs an ExactSpec")
+        size = {} if bin_mm is None else {"bin_mm": bin_mm}
+        self.spec = (spec or ExactSpec()).with_options({**options, **size})
+        self.most_bins = None if bins is None else whole_number(bins, "bins", 1, MOST_BINS)
+        seed = whole_number(seed, "seed", 0, LARGEST_SEED)
+        self.arguments = {
+            "policy": policy, "bins": self.most_bins, "plan": plan, "catalogue": catalogue,
+            "grid_mm": grid_mm, "seed": seed,
+        }  # fmt: skip
+        self.present = check_present(present, self.spec)
+        self.policy: PackerPolicy = make_packer_policy(
+            policy, self.spec, plan=plan, catalogue=catalogue, grid_mm=grid_mm, seed=seed
+        )
+        self.calls: list[Call] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        """Open the first bin, with the boxes that are there already."""
+        self.packed: list[list[Packed]] = []
+        self.left_out: list[LeftOut] = []
+        self._shown: list[Goods] = []
+        self._offered: tuple[Goods, Goods, Placement | NoPlace, int] | None = None
+        self._closed_weights: list[float] = []
+        self._open_bin(self.present)
+
+    def _open_bin(self, present: Present | None = None) -> None:
+        """Open the next bin."""
+        if self.packed:
+            self._closed_weights.append(float(self.bin.weight[0]))
+        self.bin = ExactBins(1, self.spec)
+        self.packed.append([])
+        if present is None:
+            return
+        for k in range(len(present.rows)):
+            item, row = present.goods[[k]], _whole(present.rows[k])
+            self._add(item, row, self._answer(item, row, -1, self._support(item, row)))
+
+    # --- boxes ------------------------------------------------------------------------------------
+
+    def offer(self, sides: Sequence[float], **attributes: Any) -> Placement | NoPlace:
+        """Return what :meth:`place` would do; nothing changes.
+
+        Args:
+            sides: the box's own sides w, d, h in millimetres.
+            **attributes: as for :meth:`place`.
+        """
+        return self._offer(self._goods(sides, attributes))[1]
+
+    def place(self, sides: Sequence[float], **attributes: Any) -> Placement | NoPlace:
+        """Place a box.
+
+        Args:
+            sides: the box's own sides w, d, h in millimetres.
+            **attributes: ``id`` (a text or a number), ``weight`` (kilograms), ``upright`` (whether
+                it may not be tipped), ``orientations`` (a list of 0 … 5), ``stackable`` (whether
+                anything may rest on it) and ``max_load`` (kilograms of all boxes above it).
+
+        Returns:
+            The placement; or :class:`marl_pack.packer.answers.NoPlace` with the reason, and then
+            nothing has changed.
+
+        Raises:
+            ValueError: if a side or an attribute is impossible; says what would be right.
+        """
+        item, answer, move = self._offer(self._goods(sides, attributes))
+        if isinstance(answer, Placement):
+            self._do(Placed(item, answer.bin, move))
+        return answer
+
+    def skip(self, sides: Sequence[float], **attributes: Any) -> NoPlace:
+        """Leave out a box that has no place, and record why; the plan lists it.
+
+        Args:
+            sides, **attributes: the box, as for :meth:`place`.
+
+        Raises:
+            ValueError: if the box has a place, or is impossible.
+        """
+        item, answer, _ = self._offer(self._goods(sides, attributes))
+        if isinstance(answer, Placement):
+            raise ValueError("skip: the box has a place; place it")
+        self._do(Skipped(item, answer.code, answer.reason))
+        return answer
+
+    def next_bin(self) -> int:
+        """Close the open bin and open the next one; return its number.
+
+        Raises:
+            ValueError: if the open bin is empty, or no more bins may be opened.
+        """
+        if not self.packed[-1]:
+            raise ValueError("next_bin: the open bin is empty")
+        if self.most_bins is not None and len(self.packed) >= self.most_bins:
+            raise ValueError(f"next_bin: all {self.most_bins} bins are open or closed")
+        self._do(Opened())
+        return len(self.packed) - 1
+
+    def actual(self, pose: Pose | Sequence[float]) -> Placement:
+        """Report where the robot really put the box that was placed last.
+
+        Later boxes keep away from the smallest rectangle around the rotated box, and rest only on a
+        rectangle inside it. A pose that breaks the rule is accepted; ``problem`` says so.
+
+        Args:
+            pose: x, y of the box's middle in millimetres, and its yaw in degrees
+                (:class:`marl_pack.packer.poses.Pose`).
+
+        Returns:
+            The placement as it is.
+
+        Raises:
+            ValueError: if no box was placed in the open bin, or one cannot be there: it would
+                overlap another box or reach out of the bin.
+        """
+        self._do(Reported(Pose.of(pose)))
+        return self.packed[-1][-1].placement
+
+    def undo(self) -> None:
+        """Undo the last call of ``place``, ``skip``, ``next_bin`` or ``actual``.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        if not self.calls:
+            raise ValueError("undo: nothing was done yet")
+        self._replay(self.calls[:-1])
+
+    # --- what was done ----------------------------------------------------------------------------
+
+    @property
+    def placements(self) -> tuple[Placement, ...]:
+        """The placements so far, in order; boxes that were there already come first."""
+        return tuple(packed.placement for bin in self.packed for packed in bin)
+
+    @property
+    def state(self) -> PackerState:
+        """What the packer has done so far."""
+        volume = self.bin.volume
+        margins = [p.margin for p in self.placements if p.z > 0]
+        return PackerState(
+            len(self.packed),
+            tuple(len(bin) for bin in self.packed),
+            tuple(
+                float(sum(float(box.item.volumes[0]) for box in bin) / volume)
+                for bin in self.packed
+            ),
+            (*self._closed_weights, float(self.bin.weight[0])),
+            tuple(self.left_out),
+            min(margins, default=None),
+        )
+
+    @property
+    def plan(self) -> Plan:
+        """All boxes placed so far, in millimetres, and those that were left out."""
+        boxes = [packed for bin in self.packed for packed in bin]
+        placed = [box.placement for box in boxes]
+        items = joined([box.item for box in boxes], self.spec.unit_mm)
+        weights, known = self.bin.weights_of(items)
+        rows = np.array([(p.x, p.y, p.z, p.w, p.d, p.h) for p in placed]).reshape(-1, 6)
+        if (rows == np.round(rows)).all() and _whole_numbers(self.spec.bin_mm):
+            rows = rows.astype(np.int64)
+        size = np.array(self.spec.bin_mm)
+        return Plan(
+            np.tile(size.astype(rows.dtype), (len(self.packed), 1)),
+            np.array([p.bin for p in placed], np.int64), rows[:, :3], rows[:, 3:],
+            np.array([p.orientation for p in placed], np.int64), weights,
+            np.array([p.centre[:2] for p in placed]).reshape(-1, 2),
+            tuple(p.id for p in placed), 1.0,
+            yaws=np.array([p.yaw for p in placed]),
+            weights_assumed=~known,
+            stackable=items.stackable, max_loads=items.max_load,
+            supports=np.array([p.support for p in placed]),
+            margins=np.array([p.margin for p in placed]),
+            left_out=tuple(self.left_out),
+        )  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write everything that :meth:`restore` needs to a JSON file.
+
+        A function as the policy, and a catalogue that is not a file, are not saved: they have to be
+        given to :meth:`restore`.
+        """
+        write_json(Path(path), calls.to_dict(self))
+
+    @classmethod
+    def restore(cls, path: str | Path, **arguments: Any) -> Packer:
+        """Return the packer that :meth:`save` wrote.
+
+        The calls are done again and every placement is checked, so the file need not be trusted.
+
+        Args:
+            path: the file.
+            **arguments: arguments of the packer that replace those in the file, such as ``policy``.
+
+        Raises:
+            ValueError: if the file is not such a file, or a call in it is impossible.
+        """
+        content = read_json(Path(path))
+        try:
+            made, rows = calls.read(content)
+            packer = cls(**calls.complete(made, arguments))
+            packer._replay([calls.of_row(row, packer.spec) for row in rows])
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        return packer
+
+    # --- calls ------------------------------------------------------------------------------------
+
+    def _do(self, call: Call) -> None:
+        """Do a call and record it; if it is impossible, nothing changes."""
+        self._apply(call)
+        self._offered = None
+        self.calls.append(call)
+
+    def _replay(self, done: list[Call]) -> None:
+        """Begin anew and do calls; if one is impossible, nothing changes."""
+        before = dict(vars(self))
+        try:
+            self._begin()
+            for call in done:
+                self._apply(call)
+            self.calls = done
+        except ValueError:
+            vars(self).update(before)
+            raise
+
+    def _apply(self, call: Call) -> None:
+        """Change the bins by a call.
+
+        Raises:
+            ValueError: if it is impossible.
+        """
+        if isinstance(call, Placed):
+            self._apply_placed(call)
+        elif isinstance(call, Reported):
+            self._apply_reported(call.pose)
+        elif isinstance(call, Skipped):
+            sides = to_mm(call.item.sides[0], self.spec.unit_mm).tolist()
+            self._shown.append(call.item)
+            name = str(call.item.ids[0])
+            self.left_out.append(LeftOut(name, (sides[0], sides[1], sides[2]), call.reason))
+        else:
+            self._open_bin()
+
+    def _apply_placed(self, call: Placed) -> None:
+        """Place a box in the open bin, or in the next one."""
+        if call.bin == len(self.packed) and self.packed[-1]:
+            self._open_bin()
+        move = np.array([call.move])
+        if call.bin != len(self.packed) - 1 or not self.bin.legal(call.item, move)[0]:
+            raise ValueError(f"box {str(call.item.ids[0])!r}: its placement is not legal")
+        row = _row_of(call.item, call.move)
+        answer = self._answer(call.item, row, call.move & 7, self._support(call.item, row))
+        self._shown.append(call.item)
+        self._add(call.item, row, answer)
+
+    def _add(self, item: Goods, row: NDArray[np.int64], answer: Placement) -> None:
+        """Add a box at a row to the open bin."""
+        self.bin.add(row[None], item, np.ones(1, np.bool_))
+        unit = self.spec.unit_mm
+        middle = answer.centre[0] / unit, answer.centre[1] / unit
+        self.packed[-1].append(Packed(item, answer, row, middle))
+
+    def _apply_reported(self, pose: Pose) -> None:
+        """Move the last box of the open bin to the pose that a robot reported."""
+        bin, unit = self.packed[-1], self.spec.unit_mm
+        if not bin or (len(bin) == len(self.present.rows) and len(self.packed) == 1):
+            raise ValueError("actual: no box was placed in the open bin")
+        *others, last = bin
+        planned = last.placement
+        x, y = pose.x / unit, pose.y / unit
+        w, d, h = (round(side / unit) for side in (planned.w, planned.d, planned.h))
+        around, inside = rectangles(x, y, w, d, pose.yaw)
+        if (around[:2] < 0).any() or (around[2:] > self.bin.size[:2]).any():
+            raise ValueError(f"actual: box {planned.id!r} would reach out of the bin at {pose}")
+        shape = x, y, w, d, pose.yaw
+        z = 0
+        for box in others:
+            top = int(box.row[2] + box.row[5])
+            if top <= round(planned.z / unit) and overlap(shape, _shape(box, unit)) > TOUCHING:
+                z = max(z, top)
+        for box in others:
+            low, high = int(box.row[2]), int(box.row[2] + box.row[5])
+            depth = overlap(shape, _shape(box, unit))
+            if low < z + h and high > z and depth > TOUCHING:
+                raise ValueError(
+                    f"actual: box {planned.id!r} would overlap box {box.placement.id!r} by "
+                    f"{depth * unit:.1f} mm at {pose}"
+                )
+        # The bin without the box, then with it at its pose.
+        self.bin = ExactBins(1, self.spec)
+        for box in others:
+            self.bin.add(box.row[None], box.item, np.ones(1, np.bool_))
+        bin.pop()
+        row = np.array((*around[:2], z, *(around[2:] - around[:2]), h, *inside), np.int64)
+        support = self._support(last.item, row)
+        answer = Placement(
+            planned.id, planned.bin, planned.orientation, pose.x - planned.w / 2,
+            pose.y - planned.d / 2, float(to_mm(z, unit)), planned.w, planned.d, planned.h,
+            (pose.x, pose.y, float(to_mm(z, unit)) + planned.h / 2), support.share,
+            float(to_mm(support.margin, unit)), pose.yaw,
+            "" if support.stands else f"it does not stand there by the rule {self.spec.rule}",
+        )  # fmt: skip
+        self._add(last.item, row, answer)
+
+    # --- offers -----------------------------------------------------------------------------------
+
+    def _goods(self, sides: Sequence[float], attributes: Mapping[str, Any]) -> Goods:
+        """Return a box as one row of goods; refuse impossible values."""
+        return calls.goods_of(sides, attributes, self.spec)
+
+    def _offer(self, item: Goods) -> tuple[Goods, Placement | NoPlace, int]:
+        """Return a box, what :meth:`place` would answer, and the move."""
+        if self._offered is not None and self._offered[0].same(item):
+            return self._offered[1], self._offered[2], self._offered[3]
+        sides = to_mm(item.sides, self.spec.unit_mm)
+        try:
+            able = fitting(item, self.spec, sides, "box")
+        except ValueError as error:
+            answer: Placement | NoPlace = NoPlace(str(item.ids[0]), "too_large", str(error))
+            able, move = item, -1
+        else:
+            answer, move = self._choose(able)
+        self._offered = item, able, answer, move
+        return able, answer, move
+
+    def _choose(self, item: Goods) -> tuple[Placement | NoPlace, int]:
+        """Choose a place in the open bin or, if there is none, in the next one."""
+        more = self.most_bins is None or len(self.packed) < self.most_bins
+        bins = [self.bin]
+        if self.packed[-1] and more:
+            bins.append(ExactBins(1, self.spec))
+        history = joined([*self._shown, item], self.spec.unit_mm)
+        for k, bin in enumerate(bins, len(self.packed) - 1):
+            turn = Turn(bin, item, history)
+            move = int(self.policy(turn)[0]) if turn.alive[0] else -1
+            if move < 0:
+                continue
+            if not bin.legal(item, np.array([move]))[0]:
+                raise ValueError(f"the policy chose a move that is not legal: {move}")
+            row = _row_of(item, move)
+            support = measure(bin, row, float(bin.weights_of(item)[0][0]), bin.blocked(0, item))
+            return self._answer(item, row, move & 7, support, k), move
+        return why_not(self.bin, item), -1
+
+    def _support(self, item: Goods, row: NDArray[np.int64]) -> Support:
+        """Measure the support of a box at a row of the open bin."""
+        weight = float(self.bin.weights_of(item)[0][0])
+        return measure(self.bin, row, weight, self.bin.blocked(0, item))
+
+    def _answer(
+        self, item: Goods, row: NDArray[np.int64], orientation: int, support: Support,
+        bin: int | None = None,
+    ) -> Placement:  # fmt: skip
+        """Return the placement of a box at a row."""
+        x, y, z, w, d, h = to_mm(row[:6], self.spec.unit_mm).tolist()
+        return Placement(
+            str(item.ids[0]), len(self.packed) - 1 if bin is None else bin, orientation, x, y, z, w,
+            d, h, (x + w / 2, y + d / 2, z + h / 2), support.share,
+            float(to_mm(support.margin, self.spec.unit_mm)),
+        )  # fmt: skip
+
+
+def _shape(box: Packed, unit: float) -> tuple[float, float, float, float, float]:
+    """Return middle, sides and yaw of a box seen from above, in units."""
+    placed = box.placement
+    return (*box.middle, placed.w / unit, placed.d / unit, placed.yaw)
+
+
+def _whole(row: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the row of the state of a box whose whole top carries, int64 [10]."""
+    return np.concatenate((row, row[:2], row[:2] + row[3:5]))
+
+
+def _row_of(item: Goods, move: int) -> NDArray[np.int64]:
+    """Return the row of the state of an item at a move, int64 [10]."""
+    where = placements(move)
+    return _whole(np.concatenate((where[1:], item.sides[0][AXES[where[0]]])))
+
+
+def _whole_numbers(values: Sequence[float]) -> bool:
+    return all(float(value).is_integer() for value in values)

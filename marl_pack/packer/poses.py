@@ -1,0 +1,128 @@
+"""Rotated boxes seen from above: the rectangles around and inside them, and overlaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_pack.checks import real_number, shown
+from marl_pack.plan_columns import MOST_YAW
+
+ROUNDING = 1e-6
+"""Units by which a float may be wrong."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a robot really put a box.
+
+    Args:
+        x, y: the middle of the box in the bin, in millimetres.
+        yaw: rotation about the vertical from the planned orientation, in degrees, counterclockwise
+            seen from above.
+
+    Raises:
+        ValueError: unless these are numbers, and the yaw is from -45 to 45.
+    """
+
+    x: float
+    y: float
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "yaw"):
+            object.__setattr__(self, name, real_number(getattr(self, name), f"pose: {name}"))
+        if abs(self.yaw) > MOST_YAW:
+            raise ValueError(
+                f"pose: yaw = {self.yaw:g}: needs degrees from -{MOST_YAW:g} to {MOST_YAW:g}"
+            )
+
+    @classmethod
+    def of(cls, value: Pose | Sequence[float]) -> Pose:
+        """Return a pose, also from two or three numbers x, y, yaw.
+
+        Raises:
+            ValueError: for anything else.
+        """
+        if isinstance(value, Pose):
+            return value
+        if not isinstance(value, Sequence | np.ndarray) or len(value) not in (2, 3):
+            raise ValueError(f"pose {shown(value)}: needs x, y in mm and yaw in degrees")
+        return cls(*value)
+
+
+def rectangles(
+    x: float, y: float, w: float, d: float, yaw: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rectangles along the axes around and inside a rotated footprint, in whole units.
+
+    Args:
+        x, y: middle of the footprint, in units.
+        w, d: its sides, in units.
+        yaw: its rotation in degrees, at most 45.
+
+    Returns:
+        The smallest rectangle around it and a large one inside it, int64 [4] each, x0, y0, x1, y1.
+        They are rounded outwards and inwards.
+    """
+    angle = math.radians(abs(yaw))
+    cos, sin = math.cos(angle), math.sin(angle)
+    outer = np.array((w * cos + d * sin, w * sin + d * cos)) / 2
+    inner = np.array(inner_sides(w, d, cos, sin)) / 2
+    middle = np.array((x, y))
+    around = np.concatenate(
+        (np.floor(middle - outer + ROUNDING), np.ceil(middle + outer - ROUNDING))
+    )
+    inside = np.concatenate(
+        (np.ceil(middle - inner - ROUNDING), np.floor(middle + inner + ROUNDING))
+    )
+    return around.astype(np.int64), inside.astype(np.int64)
+
+
+def inner_sides(w: float, d: float, cos: float, sin: float) -> tuple[float, float]:
+    """Return the sides of a large rectangle along the axes inside a rotated rectangle w × d.
+
+    A rectangle p × q with the same middle is inside if p · cos + q · sin ≤ w and
+    p · sin + q · cos ≤ d. Either both hold with equality, or the shorter side alone binds.
+    """
+    if sin == 0:
+        return w, d
+    short = min(w, d)
+    thin = short / (2 * sin), short / (2 * cos)  # the largest if one side alone binds
+    candidates = [thin, thin[::-1]]
+    double = cos * cos - sin * sin
+    if double > 0:
+        candidates.append(((w * cos - d * sin) / double, (d * cos - w * sin) / double))
+    inside = [
+        (p, q)
+        for p, q in candidates
+        if p > 0 and q > 0
+        and p * cos + q * sin <= w * (1 + 1e-12) and p * sin + q * cos <= d * (1 + 1e-12)
+    ]  # fmt: skip
+    return max(inside, key=lambda sides: sides[0] * sides[1])
+
+
+def overlap(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return by how much two rotated rectangles overlap, seen from above; negative for a gap.
+
+    It is the least overlap along a side of one of the two (separating axis theorem).
+
+    Args:
+        a, b: middle x, y, sides w, d, and the rotation in degrees.
+    """
+    least = math.inf
+    for one, other in ((a, b), (b, a)):
+        cos, sin = math.cos(math.radians(one[4])), math.sin(math.radians(one[4]))
+        turn = math.radians(other[4] - one[4])
+        c, s = abs(math.cos(turn)), abs(math.sin(turn))
+        dx, dy = other[0] - one[0], other[1] - one[1]
+        along = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
+        reach = (other[2] * c + other[3] * s) / 2, (other[2] * s + other[3] * c) / 2
+        least = min(
+            least, one[2] / 2 + reach[0] - along[0], one[3] / 2 + reach[1] - along[1]
+        )
+    return least
