@@ -15,6 +15,7 @@ import marl_pack
 from marl_pack.terminal import Parser
 
 COMMANDS = {
+    "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
     "train": ("marl_pack.train", "train the two agents, or resume a run"),
     "evaluate": ("marl_pack.evaluate", "play many games; print and save how full the bins are"),
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),

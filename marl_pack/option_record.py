@@ -211,5 +211,5 @@ def add_arguments(
 
 def given_options(arguments: argparse.Namespace, record: type[OptionRecord]) -> dict[str, Any]:
     """Return the options of a record that were given on a command line."""
-    values = {each.name: getattr(arguments, each.name) for each in options_of(record)}
+    values = {each.name: getattr(arguments, each.name, None) for each in options_of(record)}
     return {name: value for name, value in values.items() if value is not None}

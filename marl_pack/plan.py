@@ -38,7 +38,8 @@ VERSION = 2
 """Version of a plan in JSON. Version 1 had no ``version`` and only the keys :data:`BOX`."""
 KEYS = (UNIT, "bins", "boxes")
 """Keys that every plan has in JSON."""
-OPTIONAL = ("$schema", "version", "left_out")
+OPTIONAL = ("version", "orders", "left_out")
+"""Keys that a plan may have."""
 LEFT_OUT = ("id", "w", "d", "h", "reason")
 """Keys of a box without a place."""
 
@@ -80,6 +81,7 @@ class Plan:
     supports: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] NaN: unknown
     margins: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] NaN: unknown
     left_out: tuple[LeftOut, ...] = ()  # boxes that had no place
+    orders: tuple[str, ...] = ()  # [B]  order of each bin; () if there are no orders
 
     def __post_init__(self) -> None:
         n, b = len(self.positions), len(self.bin_sizes)
@@ -107,6 +109,11 @@ class Plan:
             object.__setattr__(self, extra.field, values)
         object.__setattr__(self, "ids", tuple(self.ids))
         object.__setattr__(self, "left_out", tuple(self.left_out))
+        object.__setattr__(self, "orders", tuple(self.orders))
+        if self.orders and (
+            len(self.orders) != b or not all(isinstance(name, str) for name in self.orders)
+        ):
+            raise ValueError(f"orders: needs one text for each of {b} bins")
         if len(self.ids) != n or not all(isinstance(name, str) for name in self.ids):
             raise ValueError(f"ids: needs one text for each of {n} boxes")
         self._check_values()
@@ -233,7 +240,8 @@ class Plan:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
             return NotImplemented
-        if (self.ids, self.unit_mm, self.left_out) != (other.ids, other.unit_mm, other.left_out):
+        plain = ("ids", "unit_mm", "left_out", "orders")
+        if any(getattr(self, name) != getattr(other, name) for name in plain):
             return False
         arrays = [f.name for f in fields(Plan) if isinstance(getattr(self, f.name), np.ndarray)]
         return all(
@@ -296,20 +304,25 @@ class Plan:
 
     def first(self, count: int) -> Plan:
         """Return the plan of the first ``count`` boxes, in the same bins."""
-        return self._select(np.arange(len(self)) < count, self.bins, self.bin_sizes)
+        chosen = np.arange(len(self)) < count
+        return self._select(chosen, self.bins, self.bin_sizes, self.orders)
 
     def in_bin(self, index: int) -> Plan:
         """Return the boxes of one bin as a plan of that bin alone."""
         sizes = self.bin_sizes[index : index + 1]
-        return self._select(self.bins == index, np.zeros_like(self.bins), sizes)
+        orders = self.orders[index : index + 1]
+        return self._select(self.bins == index, np.zeros_like(self.bins), sizes, orders)
 
-    def _select(self, which: NDArray[np.bool_], bins: Array, bin_sizes: Array) -> Plan:
+    def _select(
+        self, which: NDArray[np.bool_], bins: Array, bin_sizes: Array, orders: Sequence[str]
+    ) -> Plan:
         """Return the plan of the boxes ``which`` [n]; ``bins`` [n] replaces the bin of each box."""
         return Plan(
             bin_sizes, bins[which], self.positions[which], self.sides[which],
             self.orientations[which], self.weights[which], self.centres[which],
             tuple(name for name, chosen in zip(self.ids, which, strict=True) if chosen),
-            self.unit_mm, **{e.field: getattr(self, e.field)[which] for e in EXTRAS},
+            self.unit_mm, orders=tuple(orders),
+            **{e.field: getattr(self, e.field)[which] for e in EXTRAS},
         )  # fmt: skip
 
     # --- files of one plan ------------------------------------------------------------------------
@@ -341,7 +354,7 @@ class Plan:
         """Return the plan as a dict for JSON; ``plan.schema.json`` describes it.
 
         Its keys are ``version``, ``unit_mm``, ``bins`` (rows W, D, H), ``boxes`` and, if there are
-        any, ``left_out``. Each box is a dict with the keys :data:`BOX`, and those of
+        any, ``orders`` and ``left_out``. Each box is a dict with the keys :data:`BOX`, and those of
         :data:`marl_pack.plan_columns.EXTRAS` where its value is not the default.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
@@ -351,6 +364,8 @@ class Plan:
                     box[extra.key] = value
         sizes = self.bin_sizes.tolist()
         content = {"version": VERSION, UNIT: self.unit_mm, "bins": sizes, "boxes": boxes}
+        if self.orders:
+            content["orders"] = list(self.orders)
         if self.left_out:
             content["left_out"] = [
                 dict(zip(LEFT_OUT, (box.id, *box.sides, box.reason), strict=True))
@@ -395,6 +410,9 @@ class Plan:
                     value = extra.of_json(box[extra.key]) if extra.key in box else extra.default
                     others[extra.field].append(value)
             others["left_out"] = _left_out(content.get("left_out", []))
+            others["orders"] = content.get("orders", [])
+            if not isinstance(others["orders"], list):
+                raise ValueError("orders: needs a list of texts")
             if content[UNIT] is not None:
                 real_number(content[UNIT], UNIT)
         except ValueError as error:

@@ -89,7 +89,7 @@ def test_a_policy_of_the_users_own(words: list[str], tmp_path: Path) -> None:
         (["--order", "draw"], "needs length"),
         (["--length", "40"], "needs at least 40"),
         (["--episodes", "3"], "--episodes 3: needs 1"),
-        (["--unit-mm", "1"], "row 2 is [205.5, 200.0, 200.0]: needs whole units of 1 mm"),
+        (["--unit-mm", "1"], "row 2 (line 4) is [205.5, 200.0, 200.0]: needs whole units of 1 mm"),
     ],
 )
 def test_a_wrong_option_says_what_would_be_right(

@@ -84,6 +84,19 @@ class Goods:
         return self.sides.astype(np.float64).prod(-1)
 
 
+class Lines(str):
+    """The name of a file whose rows have numbers of lines, for messages."""
+
+    numbers: Sequence[int]
+
+    @classmethod
+    def of(cls, path: Any, numbers: Sequence[int]) -> Lines:
+        """Return the name of a file; ``numbers[i]`` is the line of row i."""
+        lines = cls(path)
+        lines.numbers = numbers
+        return lines
+
+
 def joined(parts: Sequence[Goods], unit_mm: float) -> Goods:
     """Return the rows of several goods in one record; all have the same unit."""
     names = [f.name for f in fields(Goods) if f.name != "unit_mm"]
@@ -150,12 +163,24 @@ def check_goods(
     )
     if fit:
         goods = fitting(goods, spec, rows, source)
-    quantity = values.get("quantity")
-    if quantity is None:
+    if "quantity" not in values:
         return goods
+    return goods[np.arange(count).repeat(quantities(values["quantity"], rows, source))]
+
+
+def quantities(values: Any, rows: NDArray[Any], source: str) -> NDArray[np.int64]:
+    """Return how many boxes each row stands for, int64 [R]; None: one each.
+
+    Raises:
+        ValueError: if a quantity is not a whole number, or there are too many boxes.
+    """
+    if values is None:
+        return np.ones(len(rows), np.int64)
+    (attribute,) = (a for a in GOODS_ATTRIBUTES if a.key == "quantity")
+    quantity = _column(attribute, values, rows, source)
     if quantity.sum(dtype=np.float64) > MOST_ROWS:
         raise ValueError(f"{source}: {quantity.sum()} boxes: needs at most {MOST_ROWS}")
-    return goods[np.arange(count).repeat(quantity)]
+    return quantity
 
 
 def number_rows(values: Any, width: int, source: str, what: str) -> NDArray[np.float64]:
@@ -262,7 +287,8 @@ def _allowed(
 def _refuse(wrong: Any, rows: NDArray[Any], source: str, why: str) -> None:
     """Raise ValueError about the first row where ``wrong`` [R] is true, if there is one."""
     for i in np.flatnonzero(wrong)[:1].tolist():
-        raise ValueError(f"{source}: row {i} is {shown(rows[i].tolist())}: {why}")
+        line = f" (line {source.numbers[i]})" if isinstance(source, Lines) else ""
+        raise ValueError(f"{source}: row {i}{line} is {shown(rows[i].tolist())}: {why}")
 
 
 def goods_of(items: Any, spec: ExactSpec, source: str = "items") -> Goods:

@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.checks import described, shown, whole_number
-from marl_pack.exact.goods import GOODS_ATTRIBUTES, Goods, check_goods, goods_of
+from marl_pack.exact.goods import (
+    GOODS_ATTRIBUTES,
+    Goods,
+    Lines,
+    check_goods,
+    goods_of,
+    joined,
+    quantities,
+)
 from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.inputs import read_json
 from marl_pack.items.names import check_names
@@ -21,7 +29,7 @@ from marl_pack.items.tables import read_sides, read_table, sequence_order
 LONGEST = 1e9
 """No length in millimetres is longer."""
 SIDES = ("w_mm", "d_mm", "h_mm")
-COLUMNS = (*SIDES, *(attribute.column for attribute in GOODS_ATTRIBUTES), "sequence")
+COLUMNS = (*SIDES, *(attribute.column for attribute in GOODS_ATTRIBUTES), "order", "sequence")
 """Columns of a CSV file of goods, and keys of the records of a JSON file."""
 
 
@@ -118,25 +126,45 @@ def windows(goods: Goods, length: int) -> Given:
 
 
 def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
-    """Read a CSV or JSON file of goods.
+    """Read a file of goods (:func:`read_orders`).
+
+    Returns:
+        The goods, one sequence after the other, and the number of boxes in each sequence, int64.
+    """
+    orders = read_orders(path, spec)
+    goods = joined([order.goods for order in orders], spec.unit_mm)
+    return goods, np.array([len(order.goods) for order in orders])
+
+
+@dataclass(frozen=True)
+class Order:
+    """The boxes of one order, or one sequence, in their order."""
+
+    name: str  # "" where it has none
+    goods: Goods
+
+
+def read_orders(path: Path, spec: ExactSpec) -> list[Order]:
+    """Read a file of goods.
 
     A CSV file has the columns :data:`COLUMNS`; only ``w_mm``, ``d_mm`` and ``h_mm`` are needed. A
     JSON file has a list of records with such keys. A value that is left out is the default. Rows
-    with the same ``sequence`` belong to one sequence.
+    with the same ``order``, or ``sequence``, belong together. A JSON file may also have orders in
+    the format of BED-BPP (Kagerer et al. 2023); its boxes stay upright.
 
     Args:
         path: the file.
         spec: the game.
 
-    Returns:
-        The goods, one sequence after the other, and the number of boxes in each sequence, int64.
-
     Raises:
         ValueError: naming the row, the column and what would be right.
     """
     suffix = path.suffix.lower()
+    numbers: list[int] = []
     if suffix == ".csv":
-        columns: dict[str, Any] = dict(read_table(path, COLUMNS, SIDES, blanks=True))
+        columns: dict[str, Any] = dict(
+            read_table(path, COLUMNS, SIDES, blanks=True, numbers=numbers)
+        )
         sides = read_sides(path, columns, SIDES, "a length in mm")
         for attribute in GOODS_ATTRIBUTES:
             if attribute.column in columns:
@@ -144,38 +172,84 @@ def read_goods(path: Path, spec: ExactSpec) -> tuple[Goods, NDArray[np.int64]]:
                 given = iter(attribute.of_cells([text for text in texts if text]))
                 columns[attribute.column] = [next(given) if text else None for text in texts]
     elif suffix == ".json":
-        columns = _records(path)
+        content = read_json(path)
+        columns = _of_bed_bpp(path, content) if isinstance(content, dict) else {}
+        columns = columns or _records(path, content)
         sides = np.array([columns[name] for name in SIDES], object).T
         sides = _numbers(sides, path)
     else:
         raise ValueError(f"{path}: unknown ending {path.suffix!r}: needs one of .csv, .json")
-    names = [str(name or "") for name in columns.get("sequence", [""] * len(sides))]
-    order, counts = sequence_order(names)
+    if {"order", "sequence"} <= set(columns):
+        raise ValueError(f"{path}: has order and sequence, which mean the same; needs one of them")
+    names = columns.get("order", columns.get("sequence", [""] * len(sides)))
+    names = ["" if name is None else str(name) for name in names]
     values = {
-        attribute.key: [columns[attribute.column][i] for i in order.tolist()]
+        attribute.key: columns[attribute.column]
         for attribute in GOODS_ATTRIBUTES
-        if attribute.column in columns
+        if attribute.column in columns and attribute.key != "quantity"
     }
-    goods = check_goods(sides[order], spec, values, source=str(path))
-    if "quantity" in values:
-        quantity = np.array([1 if q is None else q for q in values["quantity"]], np.int64)
-        counts = np.add.reduceat(quantity, counts.cumsum() - counts)
-    return goods, counts
+    source = Lines.of(path, numbers) if numbers else str(path)
+    goods = check_goods(sides, spec, values, source=source)
+    repeats = quantities(columns.get("quantity"), sides, source)
+    order, counts = sequence_order(names)
+    ends = counts.cumsum()
+    parts = [order[end - count : end] for end, count in zip(ends, counts, strict=True)]
+    return [Order(names[part[0]], goods[part.repeat(repeats[part])]) for part in parts]
 
 
-def _records(path: Path) -> dict[str, list[Any]]:
+def _of_bed_bpp(path: Path, content: dict[str, Any]) -> dict[str, list[Any]]:
+    """Return the columns of orders in BED-BPP's format; none if the content is of another kind."""
+    if not content or not all(
+        isinstance(order, dict) and isinstance(order.get("item_sequence"), dict)
+        for order in content.values()
+    ):
+        return {}
+    keys = ("length/mm", "width/mm", "height/mm", "weight/kg")
+    columns: dict[str, list[Any]] = {
+        name: [] for name in (*SIDES, "weight_kg", "id", "upright", "order")
+    }
+    for name, order in content.items():
+        for number, item in order["item_sequence"].items():
+            if not isinstance(item, dict) or not set(keys) <= set(item):
+                raise ValueError(
+                    f"{path}: order {name}, item {number}: needs the keys {', '.join(keys)}"
+                )
+            row = [*(item[key] for key in keys), str(item.get("id", "")) or None, True, name]
+            for column, value in zip(columns.values(), row, strict=True):
+                column.append(value)
+    return columns
+
+
+def _records(path: Path, content: Any) -> dict[str, list[Any]]:
     """Return the columns of a JSON file with a list of records; None where a value is left out."""
-    content = read_json(path)
     if not isinstance(content, list) or not content:
         raise ValueError(f"{path}: needs a list of records with the keys {', '.join(SIDES)}")
     for i, record in enumerate(content):
-        if not isinstance(record, dict):
-            raise ValueError(f"{path}: row {i}: needs a record with the keys {', '.join(SIDES)}")
-        check_names(record, COLUMNS, SIDES, f"{path}: row {i}", "key")
-        if not isinstance(record.get("sequence", ""), str | int):
-            raise ValueError(f"{path}: row {i}: sequence needs a text or a whole number")
+        check_record(record, f"{path}: row {i}")
     used = [name for name in COLUMNS if any(name in record for record in content)]
     return {name: [record.get(name) for record in content] for name in used}
+
+
+def check_record(record: Any, source: str, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a record of a box in JSON; refuse other values and unknown keys.
+
+    Args:
+        record: a dict with the keys :data:`COLUMNS`.
+        source: name of the record, for messages.
+        leave_out: keys that it may not have.
+
+    Raises:
+        ValueError: saying what is needed.
+    """
+    if not isinstance(record, dict):
+        raise ValueError(f"{source}: needs a record with the keys {', '.join(SIDES)}")
+    names = tuple(name for name in COLUMNS if name not in leave_out)
+    check_names(record, names, SIDES, source, "key")
+    for key in ("sequence", "order"):
+        value = record.get(key)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, str | int)):
+            raise ValueError(f"{source}: {key} needs a text or a whole number")
+    return record
 
 
 def _numbers(rows: NDArray[Any], path: Path) -> NDArray[np.float64]:

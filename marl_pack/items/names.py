@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 from marl_pack import renamed
@@ -29,6 +30,10 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
 """Names that other programs use → the valid names that they may stand for."""
 
 
+LENGTH = re.compile(r"(w|d|h|width|depth|length|height)([ _/(\[].*)?")
+"""Names of lengths, whatever their unit."""
+
+
 def check_names(
     names: Iterable[str], valid: Sequence[str], required: Sequence[str], source: str, what: str
 ) -> None:
@@ -51,8 +56,8 @@ def check_names(
     in_mm = [name for name in unknown if str(name).endswith("_mm")]
     if in_mm and "w" in valid:
         problems.append(f"{what} {in_mm[0]!r} is for games in millimetres (--world mm)")
-    elif "w_mm" in valid and {"w", "d", "h"} & set(unknown):
-        problems.append("lengths need to be in millimetres")
+    elif "w_mm" in valid and any(LENGTH.fullmatch(str(name).strip().lower()) for name in unknown):
+        problems.append("lengths need to be in millimetres, in w_mm, d_mm and h_mm")
     if missing:
         problems.append(f"no {what} {', '.join(map(repr, missing))}")
     if unknown:

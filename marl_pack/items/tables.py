@@ -14,7 +14,11 @@ from marl_pack.items.names import check_names
 
 
 def read_table(
-    path: Path, names: Sequence[str], required: Sequence[str], blanks: bool = False
+    path: Path,
+    names: Sequence[str],
+    required: Sequence[str],
+    blanks: bool = False,
+    numbers: list[int] | None = None,
 ) -> dict[str, list[str]]:
     """Read a CSV file; return the texts of each column by the column's name.
 
@@ -23,6 +27,7 @@ def read_table(
         names: the columns that it may have.
         required: the columns that it needs.
         blanks: whether a row may have no value in a column that is not required.
+        numbers: gets the number of each row's line in the file.
 
     Raises:
         ValueError: for a column that is missing, unknown or given twice, or a row with too few
@@ -32,6 +37,8 @@ def read_table(
     columns = [name.strip() for name in next(lines, (0, []))[1]]
     while columns and not columns[-1]:  # spreadsheets write a comma after the last column
         columns.pop()
+    if len(columns) == 1 and ";" in columns[0]:
+        raise ValueError(f"{path}: values are separated by ';'; needs commas (and decimal points)")
     check_names(columns, names, required, str(path), "column")
     if len(set(columns)) < len(columns):
         raise ValueError(f"{path}: a column is given twice; the first line is {columns}")
@@ -48,6 +55,8 @@ def read_table(
                 f"value for each of {', '.join(columns)}"
             )
         values += row
+        if numbers is not None:
+            numbers.append(line)
     if not values:
         raise ValueError(f"{path}: has no items")
     return {name: list(map(str.strip, values[i :: len(columns)])) for i, name in enumerate(columns)}

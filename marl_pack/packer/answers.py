@@ -60,6 +60,7 @@ REASONS = {
     "too_large": "larger than the empty bin in every orientation that it may take",
     "too_heavy": "the bin would become heavier than it may be",
     "unknown_weight": "the bin has a weight limit, and a weight is unknown",
+    "other_order": "the open bin belongs to another order, and no more bins may be opened",
     "full": "the bin holds as many boxes as it may",
     "no_space": "it fits nowhere between the boxes",
     "too_tall": "it would reach above the bin wherever it fits",

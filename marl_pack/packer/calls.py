@@ -42,6 +42,7 @@ class Placed:
     item: Goods  # one row
     bin: int
     move: int
+    order: str = ""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def to_row(call: Call) -> dict[str, Any]:
         orientation, x, y, z = placements(call.move).tolist()
         return {
             "call": "place", "box": _box(call.item), "bin": call.bin, "orientation": orientation,
-            "units": [x, y, z],
+            "units": [x, y, z], "order": call.order,
         }  # fmt: skip
     if isinstance(call, Reported):
         return {"call": "actual", "pose": [call.pose.x, call.pose.y, call.pose.yaw]}
@@ -135,7 +136,7 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
         ValueError: if it is not such a row.
     """
     keys = {
-        "place": ("box", "bin", "orientation", "units"), "actual": ("pose",),
+        "place": ("box", "bin", "orientation", "units", "order"), "actual": ("pose",),
         "skip": ("box", "code", "reason"), "next_bin": (),
     }  # fmt: skip
     if not isinstance(row, dict) or row.get("call") not in keys:
@@ -148,7 +149,10 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
         x, y, z = (whole_number(v, "call place: units", 0, 10**6) for v in row["units"])
         orientation = whole_number(row["orientation"], "call place: orientation", 0, 5)
         bin = whole_number(row["bin"], "call place: bin", 0)
-        return Placed(_goods(row["box"], spec), bin, int(encode(orientation, x, y, z)))
+        if not isinstance(row["order"], str):
+            raise ValueError(f"call place: order {shown(row['order'])}: needs a text")
+        item = _goods(row["box"], spec)
+        return Placed(item, bin, int(encode(orientation, x, y, z)), row["order"])
     if row["call"] == "actual":
         return Reported(Pose.of(row["pose"]))
     if row["call"] == "skip":
@@ -202,7 +206,7 @@ def read(content: Any) -> tuple[dict[str, Any], list[Any]]:
     ):  # fmt: skip
         if not isinstance(content[key], kind):
             raise ValueError(f"{key}: needs {'a list' if kind is list else 'an object'}")
-    names = ("policy", "bins", "plan", "catalogue", "grid_mm", "seed")
+    names = ("policy", "bins", "open_next", "plan", "catalogue", "grid_mm", "seed")
     check_names(content["arguments"], names, (), "arguments", "key")
     made = {"spec": ExactSpec.of(content["options"]), **content["arguments"]}
     if content["present"]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_pack.checks import LARGEST_SEED, shown, whole_number
+from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
 from marl_pack.exact.bins import ExactBins, placements
 from marl_pack.exact.goods import AXES, Goods, fitting, joined
 from marl_pack.exact.lengths import to_mm
@@ -46,6 +46,17 @@ class Packed:
 
 
 @dataclass(frozen=True)
+class _Offer:
+    """What would be done with a box."""
+
+    given: Goods  # one row
+    order: str
+    item: Goods  # the box with the orientations in which it fits
+    answer: Placement | NoPlace
+    move: int = -1
+
+
+@dataclass(frozen=True)
 class PackerState:
     """What the packer has done so far."""
 
@@ -74,8 +85,8 @@ class Packer:
             ``marl-pack tune``, a published model such as ``"rs"``, a run's folder or a checkpoint,
             or a function (:class:`marl_pack.exact.policies.ExactPolicy`).
         spec: the options; by default ``ExactSpec()``.
-        bins: largest number of bins. With more than one, the next bin is opened when a box has no
-            place in the open one; None for any number.
+        bins: largest number of bins; None for any number.
+        open_next: whether the next bin is opened when a box has no place in the open one.
         present: boxes that are in the first bin already
             (:func:`marl_pack.exact.present.check_present`).
         plan: settings of the policy ``search``, such as ``"budget=500ms"``.
@@ -97,6 +108,7 @@ class Packer:
         *,
         spec: ExactSpec | None = None,
         bins: int | None = 1,
+        open_next: bool = True,
         present: Any = (),
         plan: Any = None,
         catalogue: Any = None,
@@ -109,10 +121,11 @@ class Packer:
         size = {} if bin_mm is None else {"bin_mm": bin_mm}
         self.spec = (spec or ExactSpec()).with_options({**options, **size})
         self.most_bins = None if bins is None else whole_number(bins, "bins", 1, MOST_BINS)
+        self.open_next = truth_value(open_next, "open_next")
         seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.arguments = {
-            "policy": policy, "bins": self.most_bins, "plan": plan, "catalogue": catalogue,
-            "grid_mm": grid_mm, "seed": seed,
+            "policy": policy, "bins": self.most_bins, "open_next": open_next, "plan": plan,
+            "catalogue": catalogue, "grid_mm": grid_mm, "seed": seed,
         }  # fmt: skip
         self.present = check_present(present, self.spec)
         self.policy: PackerPolicy = make_packer_policy(
@@ -124,9 +137,10 @@ class Packer:
     def _begin(self) -> None:
         """Open the first bin, with the boxes that are there already."""
         self.packed: list[list[Packed]] = []
+        self.orders: list[str] = []
         self.left_out: list[LeftOut] = []
         self._shown: list[Goods] = []
-        self._offered: tuple[Goods, Goods, Placement | NoPlace, int] | None = None
+        self._offered: _Offer | None = None
         self._closed_weights: list[float] = []
         self._open_bin(self.present)
 
@@ -136,6 +150,7 @@ class Packer:
             self._closed_weights.append(float(self.bin.weight[0]))
         self.bin = ExactBins(1, self.spec)
         self.packed.append([])
+        self.orders.append("")
         if present is None:
             return
         for k in range(len(present.rows)):
@@ -144,20 +159,26 @@ class Packer:
 
     # --- boxes ------------------------------------------------------------------------------------
 
-    def offer(self, sides: Sequence[float], **attributes: Any) -> Placement | NoPlace:
+    def offer(
+        self, sides: Sequence[float], *, order: str = "", **attributes: Any
+    ) -> Placement | NoPlace:
         """Return what :meth:`place` would do; nothing changes.
 
         Args:
             sides: the box's own sides w, d, h in millimetres.
-            **attributes: as for :meth:`place`.
+            order, **attributes: as for :meth:`place`.
         """
-        return self._offer(self._goods(sides, attributes))[1]
+        return self._offer(self._goods(sides, attributes), order).answer
 
-    def place(self, sides: Sequence[float], **attributes: Any) -> Placement | NoPlace:
+    def place(
+        self, sides: Sequence[float], *, order: str = "", **attributes: Any
+    ) -> Placement | NoPlace:
         """Place a box.
 
         Args:
             sides: the box's own sides w, d, h in millimetres.
+            order: name of its order. A box of another order than the boxes in the open bin gets a
+                place in the next bin only.
             **attributes: ``id`` (a text or a number), ``weight`` (kilograms), ``upright`` (whether
                 it may not be tipped), ``orientations`` (a list of 0 … 5), ``stackable`` (whether
                 anything may rest on it) and ``max_load`` (kilograms of all boxes above it).
@@ -169,25 +190,25 @@ class Packer:
         Raises:
             ValueError: if a side or an attribute is impossible; says what would be right.
         """
-        item, answer, move = self._offer(self._goods(sides, attributes))
-        if isinstance(answer, Placement):
-            self._do(Placed(item, answer.bin, move))
-        return answer
+        offer = self._offer(self._goods(sides, attributes), order)
+        if isinstance(offer.answer, Placement):
+            self._do(Placed(offer.item, offer.answer.bin, offer.move, order))
+        return offer.answer
 
-    def skip(self, sides: Sequence[float], **attributes: Any) -> NoPlace:
+    def skip(self, sides: Sequence[float], *, order: str = "", **attributes: Any) -> NoPlace:
         """Leave out a box that has no place, and record why; the plan lists it.
 
         Args:
-            sides, **attributes: the box, as for :meth:`place`.
+            sides, order, **attributes: the box, as for :meth:`place`.
 
         Raises:
             ValueError: if the box has a place, or is impossible.
         """
-        item, answer, _ = self._offer(self._goods(sides, attributes))
-        if isinstance(answer, Placement):
+        offer = self._offer(self._goods(sides, attributes), order)
+        if isinstance(offer.answer, Placement):
             raise ValueError("skip: the box has a place; place it")
-        self._do(Skipped(item, answer.code, answer.reason))
-        return answer
+        self._do(Skipped(offer.item, offer.answer.code, offer.answer.reason))
+        return offer.answer
 
     def next_bin(self) -> int:
         """Close the open bin and open the next one; return its number.
@@ -279,6 +300,7 @@ class Packer:
             supports=np.array([p.support for p in placed]),
             margins=np.array([p.margin for p in placed]),
             left_out=tuple(self.left_out),
+            orders=tuple(self.orders) if any(self.orders) else (),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -356,6 +378,7 @@ class Packer:
         move = np.array([call.move])
         if call.bin != len(self.packed) - 1 or not self.bin.legal(call.item, move)[0]:
             raise ValueError(f"box {str(call.item.ids[0])!r}: its placement is not legal")
+        self.orders[-1] = call.order
         row = _row_of(call.item, call.move)
         answer = self._answer(call.item, row, call.move & 7, self._support(call.item, row))
         self._shown.append(call.item)
@@ -416,29 +439,31 @@ class Packer:
         """Return a box as one row of goods; refuse impossible values."""
         return calls.goods_of(sides, attributes, self.spec)
 
-    def _offer(self, item: Goods) -> tuple[Goods, Placement | NoPlace, int]:
-        """Return a box, what :meth:`place` would answer, and the move."""
-        if self._offered is not None and self._offered[0].same(item):
-            return self._offered[1], self._offered[2], self._offered[3]
-        sides = to_mm(item.sides, self.spec.unit_mm)
+    def _offer(self, item: Goods, order: str) -> _Offer:
+        """Return what :meth:`place` would do with a box."""
+        last = self._offered
+        if last is not None and last.order == order and last.given.same(item):
+            return last
+        if not isinstance(order, str):
+            raise ValueError(f"order {shown(order)}: needs a text")
         try:
-            able = fitting(item, self.spec, sides, "box")
+            able = fitting(item, self.spec, to_mm(item.sides, self.spec.unit_mm), "box")
         except ValueError as error:
-            answer: Placement | NoPlace = NoPlace(str(item.ids[0]), "too_large", str(error))
-            able, move = item, -1
+            self._offered = _Offer(item, order, item, _no(item, "too_large", str(error)))
         else:
-            answer, move = self._choose(able)
-        self._offered = item, able, answer, move
-        return able, answer, move
+            self._offered = _Offer(item, order, able, *self._choose(able, order))
+        return self._offered
 
-    def _choose(self, item: Goods) -> tuple[Placement | NoPlace, int]:
+    def _choose(self, item: Goods, order: str) -> tuple[Placement | NoPlace, int]:
         """Choose a place in the open bin or, if there is none, in the next one."""
         more = self.most_bins is None or len(self.packed) < self.most_bins
-        bins = [self.bin]
-        if self.packed[-1] and more:
-            bins.append(ExactBins(1, self.spec))
+        empty = not self.packed[-1]
+        fits_order = empty or self.orders[-1] == order
+        bins = {len(self.packed) - 1: self.bin} if fits_order else {}
+        if not empty and more and (self.open_next or not fits_order):
+            bins[len(self.packed)] = ExactBins(1, self.spec)
         history = joined([*self._shown, item], self.spec.unit_mm)
-        for k, bin in enumerate(bins, len(self.packed) - 1):
+        for k, bin in bins.items():
             turn = Turn(bin, item, history)
             move = int(self.policy(turn)[0]) if turn.alive[0] else -1
             if move < 0:
@@ -448,7 +473,10 @@ class Packer:
             row = _row_of(item, move)
             support = measure(bin, row, float(bin.weights_of(item)[0][0]), bin.blocked(0, item))
             return self._answer(item, row, move & 7, support, k), move
-        return why_not(self.bin, item), -1
+        if not bins:
+            bins_used = f"all {self.most_bins} bins are used"
+            return _no(item, "other_order", f"it begins an order, and {bins_used}"), -1
+        return why_not(self.bin if fits_order else bins[len(self.packed)], item), -1
 
     def _support(self, item: Goods, row: NDArray[np.int64]) -> Support:
         """Measure the support of a box at a row of the open bin."""
@@ -466,6 +494,11 @@ class Packer:
             d, h, (x + w / 2, y + d / 2, z + h / 2), support.share,
             float(to_mm(support.margin, self.spec.unit_mm)),
         )  # fmt: skip
+
+
+def _no(item: Goods, code: str, reason: str) -> NoPlace:
+    """Return that an item has no place."""
+    return NoPlace(str(item.ids[0]), code, reason)
 
 
 def _shape(box: Packed, unit: float) -> tuple[float, float, float, float, float]:
