@@ -36,7 +36,7 @@ PROGRAMS = {
     "bodies": "experiments.packing --tables bodies",
     **{name: f"experiments.{name}" for name in (
         "ablations", "learning_curve", "planning", "afterstates", "volume_spread",
-        "real_goods", "real_cell")},
+        "real_goods", "real_cell", "packer")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
     **{name: f"benchmarks.{name}" for name in (
         "masks", "rules", "room", "game", "training", "play", "exact")},

@@ -15,11 +15,11 @@ import marl_pack
 from marl_pack.terminal import Parser
 
 COMMANDS = {
-    "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
     "train": ("marl_pack.train", "train the two agents, or resume a run"),
     "evaluate": ("marl_pack.evaluate", "play many games; print and save how full the bins are"),
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),
     "export": ("marl_pack.export.command", "write trained agents as ONNX, or for rsl_rl"),
+    "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
     "tune": ("marl_pack.tune", "find the weights of the heuristic linear for your own goods"),
     "compile": ("marl_pack.compile", "compile all code now, so that no later start has to wait"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),

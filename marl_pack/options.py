@@ -17,6 +17,9 @@ from marl_pack.items.generated import no_such_file
 from marl_pack.option_record import add_arguments
 
 WORLDS = ("cells", "mm")
+NEXT_BIN, SKIP, STOP = "next-bin", "skip", "stop"
+NO_PLACE = (NEXT_BIN, SKIP, STOP)
+"""What ``pack`` does with a box that has no place in the open bin."""
 COMMON = frozenset(each.name for each in fields(GameSpec)) & {
     each.name for each in fields(ExactSpec)
 }

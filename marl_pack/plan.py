@@ -448,9 +448,7 @@ class Plan:
         lines = [[*row, *sizes[row[1]], unit] for row in self._rows()]
         used = set(self.bins.tolist())
         nothing = [""] * (len(BOX) - 2)
-        empty = [
-            ["", k, *nothing, *size, unit] for k, size in enumerate(sizes) if k not in used
-        ]
+        empty = [["", k, *nothing, *size, unit] for k, size in enumerate(sizes) if k not in used]
         if extras:
             for extra in EXTRAS:
                 values = getattr(self, extra.field).tolist()

@@ -201,13 +201,14 @@ def _load_arrays(path: Path) -> list[Plan]:
     plans = []
     for k, n in enumerate(count.tolist()):
         unit = float(arrays[UNIT][k])
+        extras: dict[str, Any] = {x.field: arrays[x.key][k, :n] for x in EXTRAS if x.key in arrays}
         try:
             plans.append(Plan(
                 sizes[k][(sizes[k] != 0).any(1)], arrays["bins"][k, :n], boxes[k, :n, :3],
                 boxes[k, :n, 3:], arrays["orientations"][k, :n], loads[k, :n, 0],
                 loads[k, :n, 1:], tuple(arrays["ids"][k, :n].tolist()),
                 None if np.isnan(unit) else unit,
-                **{x.field: arrays[x.key][k, :n] for x in EXTRAS if x.key in arrays},
+                **extras,
             ))  # fmt: skip
         except ValueError as error:
             raise ValueError(f"{path}: episode {k}: {error}") from None

@@ -13,14 +13,16 @@ LAYERS = (
      "renamed",
      "terminal"),
     ("geometry",),
-    ("bins", "items", "plan", "plan_archive", "render"),
+    ("bins", "items", "plan", "plan_archive", "plan_columns", "render"),
     ("stability", "sapien_check"),
     ("exact",),
     ("game",),
     ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
+    ("packer",),
     ("evaluation",),
     # The programs, and what only they use.
-    ("cli", "compile", "config", "evaluate", "export", "integrations", "options", "physics", "play",
+    ("cli", "compile", "config", "evaluate", "export", "feed", "integrations", "options", "pack",
+     "physics", "play",
      "players", "players_mm", "train", "training", "tune"),
 )  # fmt: skip
 

@@ -401,7 +401,7 @@ class ExactBins:
         return _waste_all(self.state, items.sides, moves)
 
     def weights_of(self, goods: Goods) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the weights of goods, assumed from their volume where unknown, and which are known.
+        """Return the weights of goods, assumed where they are unknown, and which are known.
 
         Unknown weights are those of boxes of :data:`marl_pack.sapien_check.stack.DENSITY`.
         """

@@ -206,7 +206,7 @@ def best_move(
     bounds = np.empty(fitting if kind == LINEAR else 0)
     for m in range(bounds.size):
         bounds[m] = most(weights, limits, size, item, out[m], faces[m])
-    promising = bounds.argmax() if bounds.size else 0
+    promising = int(bounds.argmax()) if bounds.size else 0
     for k in range(fitting):
         # The most promising move first: a good score spares the evaluation of many others.
         m = promising if k == 0 else k - 1 if k <= promising else k

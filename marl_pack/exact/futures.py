@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -72,7 +73,7 @@ class History:
         _, kinds = np.unique(sides, axis=0, return_inverse=True)
         rows = np.argsort(kinds, kind="stable")
         bounds = np.searchsorted(kinds[rows], np.arange(kinds.max(initial=-1) + 2))
-        equal = [rows[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        equal = [rows[a:b] for a, b in pairwise(bounds.tolist())]
         object.__setattr__(self, "_kinds", kinds.ravel())
         object.__setattr__(self, "_equal", equal)
 

@@ -50,7 +50,10 @@ def _copy_bin(source: State, b: int, target: State) -> None:
         for i in range(source.below.shape[2]):
             target.below[0, j, i] = source.below[b, j, i]
     target.weights[0, :n], target.known[0, :n] = source.weights[b, :n], source.known[b, :n]
-    target.stackable[0, :n], target.max_load[0, :n] = source.stackable[b, :n], source.max_load[b, :n]
+    target.stackable[0, :n], target.max_load[0, :n] = (
+        source.stackable[b, :n],
+        source.max_load[b, :n],
+    )
     target.carried[0, :n], target.grounded[0, :n] = source.carried[b, :n], source.grounded[b, :n]
     target.starts[0, : n + 1] = source.starts[b, : n + 1]
     rows = source.starts[b, n]
@@ -145,9 +148,7 @@ class Search:
             begin = self.clock()
             shown = game.shown(g)
             generator = np.random.default_rng((self.seed, int(game.episode[g]), len(shown)))
-            moves[g] = self._choose(
-                game.bins.select([g]), game.items[[g]], shown, generator, begin
-            )
+            moves[g] = self._choose(game.bins.select([g]), game.items[[g]], shown, generator, begin)
         return moves
 
     def ranked(self, bins: ExactBins, item: Goods) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from marl_pack.exact.bins import placements
 from marl_pack.exact.goods import DEFAULTS, KEYS, Goods, check_goods
 from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.moves import encode
+from marl_pack.exact.present import Present
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.items.names import check_names
 from marl_pack.packer.answers import REASONS
 from marl_pack.packer.poses import Pose
-
-if TYPE_CHECKING:
-    from marl_pack.packer.packer import Packer
 
 FORMAT = "marl_pack packer"
 VERSION = 1
@@ -165,26 +163,33 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def to_dict(packer: Packer) -> dict[str, Any]:
-    """Return the content of a saved packer."""
-    arguments = {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in packer.arguments.items()
+def to_dict(
+    spec: ExactSpec, arguments: Mapping[str, Any], present: Present, done: Sequence[Call]
+) -> dict[str, Any]:
+    """Return the content of a saved packer.
+
+    Args:
+        spec: its options.
+        arguments: its other arguments; those that are not numbers or texts are not saved.
+        present: the boxes that were in the first bin.
+        done: its calls.
+    """
+    texts = {
+        key: str(value) if isinstance(value, Path) else value for key, value in arguments.items()
     }
     plain = {
         key: value
-        for key, value in arguments.items()
+        for key, value in texts.items()
         if value is None or isinstance(value, str | int | float)
     }
-    goods, rows = packer.present.goods, packer.present.rows
-    unit = packer.spec.unit_mm
-    present = [
-        {"box": _box(goods[[k]]), "row": to_mm(rows[k], unit).tolist()} for k in range(len(rows))
+    boxes = [
+        {"box": _box(present.goods[[k]]), "row": to_mm(row, spec.unit_mm).tolist()}
+        for k, row in enumerate(present.rows)
     ]
     return {
-        "format": FORMAT, "version": VERSION, "options": asdict(packer.spec),
-        "arguments": plain, "not_saved": [key for key in arguments if key not in plain],
-        "present": present, "calls": [to_row(call) for call in packer.calls],
+        "format": FORMAT, "version": VERSION, "options": asdict(spec), "arguments": plain,
+        "not_saved": [key for key in texts if key not in plain], "present": boxes,
+        "calls": [to_row(call) for call in done],
     }  # fmt: skip
 
 

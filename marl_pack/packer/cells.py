@@ -154,7 +154,7 @@ class CellAgent:
             return numbers
         mask = torch.zeros(1, len(AXES), game.floor.cells, dtype=torch.bool)
         mask[0, where[shown, 0], cells[shown]] = True
-        mask = mask.unflatten(2, game.size[:2])
+        mask = mask.view(1, len(AXES), *game.size[:2])
         game.moves = Moves(mask)
         game.orientation_mask = game.moves.orientations
         game.alive = torch.ones(1, dtype=torch.bool)

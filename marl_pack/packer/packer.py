@@ -14,7 +14,6 @@ from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
 from marl_pack.exact.bins import ExactBins, placements
 from marl_pack.exact.goods import AXES, Goods, fitting, joined
 from marl_pack.exact.lengths import to_mm
-from marl_pack.exact.limits import ROW
 from marl_pack.exact.present import Present, check_present
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.support import Support, measure
@@ -133,6 +132,8 @@ class Packer:
         )
         self.calls: list[Call] = []
         self._begin()
+
+    bin: ExactBins  # the open one
 
     def _begin(self) -> None:
         """Open the first bin, with the boxes that are there already."""
@@ -309,7 +310,8 @@ class Packer:
         A function as the policy, and a catalogue that is not a file, are not saved: they have to be
         given to :meth:`restore`.
         """
-        write_json(Path(path), calls.to_dict(self))
+        content = calls.to_dict(self.spec, self.arguments, self.present, self.calls)
+        write_json(Path(path), content)
 
     @classmethod
     def restore(cls, path: str | Path, **arguments: Any) -> Packer:

@@ -14,8 +14,14 @@ from marl_pack import published, renamed
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.checks import shown
 from marl_pack.exact.futures import Catalogue, Futures, Shown
-from marl_pack.exact.policies import NAMES, TUNED, RandomMoves, Scored, make_exact_policy
-from marl_pack.exact.policies import read_weights
+from marl_pack.exact.policies import (
+    NAMES,
+    TUNED,
+    RandomMoves,
+    Scored,
+    make_exact_policy,
+    read_weights,
+)
 from marl_pack.exact.search import Search
 from marl_pack.exact.search_settings import ExactSearchSettings
 from marl_pack.exact.spec import ExactSpec
@@ -76,13 +82,13 @@ def make_packer_policy(
     if searches:
         return _search(policy, spec, plan, catalogue, seed)
     if callable(policy):
-        return policy  # type: ignore[no-any-return]
+        return policy
     if policy == "random":
         return SeededMoves(seed)
     if linear or policy in NAMES:
         return make_exact_policy(policy)  # type: ignore[return-value]  # reads what a Turn has
     if isinstance(policy, str) and is_own(policy):
-        return own_policy(policy)  # type: ignore[no-any-return]
+        return own_policy(policy)
     return _agents(policy, spec, grid_mm, seed)
 
 

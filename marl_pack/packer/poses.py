@@ -122,7 +122,5 @@ def overlap(a: Sequence[float], b: Sequence[float]) -> float:
         dx, dy = other[0] - one[0], other[1] - one[1]
         along = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
         reach = (other[2] * c + other[3] * s) / 2, (other[2] * s + other[3] * c) / 2
-        least = min(
-            least, one[2] / 2 + reach[0] - along[0], one[3] / 2 + reach[1] - along[1]
-        )
+        least = min(least, one[2] / 2 + reach[0] - along[0], one[3] / 2 + reach[1] - along[1])
     return least

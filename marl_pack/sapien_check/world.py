@@ -243,7 +243,9 @@ def collision_groups(stack: Stack, physics: Physics) -> list[list[int]]:
     on = stack.rests_on()
     near = 2 * (physics.distance + physics.contact_offset)  # both boxes may come closer
     beside, above = stack.overlaps()
-    stray = (-beside < near) & (-above < near) & ~on  # [i, j]: i could touch j later, but does not rest on it
+    stray = (
+        (-beside < near) & (-above < near) & ~on
+    )  # [i, j]: i could touch j later, but does not rest on it
     np.fill_diagonal(stray, False)
     # j and k may not share a bit if something on j could touch k without resting on it.
     apart = (on.T.astype(np.float32) @ stray.astype(np.float32)) > 0

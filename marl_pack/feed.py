@@ -1,0 +1,183 @@
+"""Feed boxes to a packer from a file or a conveyor, and print what was packed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from marl_pack.exact.spec import ExactSpec
+from marl_pack.exact.streams import read_orders
+from marl_pack.files import Growing
+from marl_pack.items.generated import no_such_file
+from marl_pack.option_record import given_options
+from marl_pack.options import NEXT_BIN, STOP
+from marl_pack.packer.answers import NoPlace, Placement
+from marl_pack.packer.calls import goods_of
+from marl_pack.packer.conveyor import Arrival, Refused, of_line, of_orders
+from marl_pack.packer.packer import Packer
+from marl_pack.packer.reasons import why_not
+from marl_pack.plan import Plan
+from marl_pack.plan_archive import save_plan
+from marl_pack.terminal import make_progress
+
+SHOWN = 20  # boxes without a place that are listed
+
+
+class Feed:
+    """A packer that is fed box after box, and the files that it keeps.
+
+    Args:
+        chosen: the parsed options.
+    """
+
+    def __init__(self, chosen: argparse.Namespace) -> None:
+        self.chosen = chosen
+        spec = ExactSpec.of(given_options(chosen, ExactSpec))
+        arguments: dict[str, Any] = {
+            "spec": spec, "policy": chosen.policy, "plan": chosen.plan,
+            "catalogue": chosen.catalogue, "grid_mm": chosen.grid_mm, "seed": chosen.seed,
+            "bins": chosen.bins, "open_next": chosen.no_place == NEXT_BIN,
+        }  # fmt: skip
+        if chosen.present is not None:
+            if not chosen.present.is_file():
+                raise FileNotFoundError(f"--present {chosen.present}: no such file")
+            read = Plan.from_csv if chosen.present.suffix == ".csv" else Plan.from_json
+            arguments["present"] = read(chosen.present)
+        self.packer = Packer(**arguments)
+        if chosen.state is not None and chosen.state.exists():
+            saved = Packer.restore(chosen.state)
+            if saved.spec != spec or saved.arguments != self.packer.arguments:
+                raise ValueError(f"--state {chosen.state}: was saved with other options")
+            self.packer = saved
+        self.times: list[float] = []  # seconds of each answer
+        self.stopped = False
+        _warm_up(arguments)
+
+    def step(self, arrival: Arrival) -> Placement | NoPlace:
+        """Place a box, or do what the options ask for if it has no place."""
+        start = time.perf_counter()
+        box = {"order": arrival.order, **arrival.attributes}
+        answer = self.packer.place(arrival.sides, **box)
+        if not answer:
+            self.stopped = self.chosen.no_place == STOP
+            if not self.stopped:
+                self.packer.skip(arrival.sides, **box)
+        self.times.append(time.perf_counter() - start)
+        return answer
+
+
+def _warm_up(arguments: dict[str, Any]) -> None:
+    """Run all code once, so that the first box does not wait while it is compiled or loaded."""
+    plan = {"plan": "budget=1ms"} if arguments["plan"] or arguments["policy"] == "search" else {}
+    packer = Packer(**{**arguments, **plan})
+    side = min(packer.spec.bin_mm) // 3 or min(packer.spec.bin_mm)
+    for _ in range(3):
+        packer.place((side, side, side), weight=1.0)
+    why_not(packer.bin, goods_of((side, side, side), {}, packer.spec))
+    packer.state, packer.plan  # noqa: B018  # read for what they compile
+
+
+def pack_file(feed: Feed, console: Console) -> None:
+    """Pack the boxes of a file, with a progress bar."""
+    path = Path(feed.chosen.boxes)
+    if not path.is_file():
+        raise no_such_file(str(path))
+    boxes = list(of_orders(read_orders(path, feed.packer.spec)))
+    growing = Growing(feed.chosen.out, save_plan)
+    with growing, make_progress(console) as bar:
+        task = bar.add_task("boxes", total=len(boxes))
+        growing.update(feed.packer.plan)
+        for arrival in boxes:
+            feed.step(arrival)
+            if feed.stopped:
+                break
+            growing.update(feed.packer.plan)
+            bar.advance(task)
+
+
+def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
+    """Answer each line of a conveyor before the next one is read.
+
+    The plan and the state are written before the answer, so a program that is killed has forgotten
+    no answer.
+
+    Args:
+        feed: the packer.
+        lines: one box a line.
+        output: gets one answer a line.
+
+    Returns:
+        The number of lines that were refused.
+    """
+    refused = 0
+    out, state = feed.chosen.out, feed.chosen.state
+    if out is not None:
+        save_plan(out, feed.packer.plan)
+    for number, text in enumerate(lines, 1):
+        start = time.perf_counter()
+        arrival = of_line(text, number, feed.packer.spec)
+        if arrival is None:
+            continue
+        if isinstance(arrival, Refused):
+            refused += 1
+            answer: dict[str, Any] = {"line": number, "error": arrival.reason}
+        else:
+            answer = {"line": number, **feed.step(arrival).to_dict()}
+            if out is not None:
+                save_plan(out, feed.packer.plan)
+            if state is not None:
+                feed.packer.save(state)
+            feed.times[-1] = time.perf_counter() - start
+            answer["ms"] = round(1000 * feed.times[-1], 3)
+        output.write(json.dumps(answer) + "\n")
+        output.flush()
+        if feed.stopped:
+            break
+    return refused
+
+
+def show(feed: Feed, console: Console) -> None:
+    """Print what was packed, and what had no place and why."""
+    state, orders = feed.packer.state, feed.packer.orders
+    table = Table()
+    columns = ["bin", "boxes", "utilization", "fill to the top", "weight", "height"]
+    for column in [*columns[:1], *(["order"] if any(orders) else []), *columns[1:]]:
+        table.add_column(column, justify="right")
+    area = feed.packer.spec.bin_mm[0] * feed.packer.spec.bin_mm[1]
+    volume = area * feed.packer.spec.bin_mm[2]
+    for k, boxes in enumerate(feed.packer.packed):
+        top = max((box.placement.z + box.placement.h for box in boxes), default=0.0)
+        fill = state.utilization[k] * volume / (area * top) if top else 0.0
+        row = [
+            str(state.boxes[k]), f"{state.utilization[k]:.1%}", f"{fill:.1%}",
+            f"{state.weight[k]:.1f} kg", f"{top:g} mm",
+        ]  # fmt: skip
+        table.add_row(str(k), *([orders[k]] if any(orders) else []), *row)
+    console.print(f"{feed.chosen.policy}, {feed.packer.spec}", soft_wrap=True)
+    console.print(table)
+    words = [f"{sum(state.boxes)} boxes in {state.bins} bins"]
+    if state.least_margin is not None:
+        words.append(f"least margin {state.least_margin:g} mm")
+    if feed.times:
+        times = np.array(feed.times) * 1000
+        words.append(f"{np.median(times):.2f} ms a box, at most {times.max():.1f} ms")
+    console.print(", ".join(words), soft_wrap=True)
+    left_out = state.left_out
+    for box in left_out[:SHOWN]:
+        sides = " x ".join(f"{side:g}" for side in box.sides)
+        name = f" {box.id!r}" if box.id else ""
+        console.print(f"no place: box{name} of {sides} mm: {box.reason}", soft_wrap=True)
+    if len(left_out) > SHOWN:
+        console.print(f"… and {len(left_out) - SHOWN} more without a place")
+    if feed.stopped:
+        console.print("stopped at the first box without a place")
+    if feed.chosen.out is not None:
+        console.print(f"plan: {feed.chosen.out}", soft_wrap=True)
