@@ -37,6 +37,8 @@ LINEAR, DBLF, HEIGHT_MIN, BEST_FIT, ANY = range(5)
 """Scores of moves: a weighted sum of features; keys as in :mod:`marl_pack.agents.keys`; or none, to
 find any legal move."""
 N_FEATURES = len(FEATURES)
+FIRST = 4
+"""Moves of the linear score that are evaluated in the order of their bounds."""
 ROUNDING = 1e-9
 """More than a sum of features can be wrong by rounding."""
 
@@ -206,14 +208,16 @@ def best_move(
     bounds = np.empty(fitting if kind == LINEAR else 0)
     for m in range(bounds.size):
         bounds[m] = most(weights, limits, size, item, out[m], faces[m])
-    promising = int(bounds.argmax()) if bounds.size else 0
-    for k in range(fitting):
-        # The most promising move first: a good score spares the evaluation of many others.
-        m = promising if k == 0 else k - 1 if k <= promising else k
+    # The most promising moves first: a good score spares the evaluation of many others.
+    first = min(FIRST, bounds.size)
+    for k in range(first + fitting):
+        m = int(bounds.argmax()) if k < first else k - first
         if kind == ANY and best >= 0:
             break
-        if kind == LINEAR and bounds[m] < keys[0] - ROUNDING:
-            continue
+        if kind == LINEAR:
+            if bounds[m] < keys[0] - ROUNDING:
+                continue
+            bounds[m] = -np.inf  # evaluated
         new = keys
         if kind != ANY:
             new = score(

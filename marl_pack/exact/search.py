@@ -31,10 +31,8 @@ if TYPE_CHECKING:
     from marl_pack.exact.packing import ExactPacking
 
 MILLISECOND = 1_000_000  # nanoseconds
-CERTAINTY = 1.0
-"""Standard errors by which a move has to be better than the one with the best score."""
-FEWEST = 3
-"""Futures that this needs at least."""
+FEWEST = 6
+"""Futures in which a move has to be tried to replace the one with the best score."""
 SHARE = 8
 """So many futures there should be time for, for each move that is tried."""
 
@@ -209,17 +207,10 @@ class Search:
             survivors = np.sort(survivors[order[: -(-len(survivors) // 2)]])
         return int(moves[self._better(int(survivors[0]), values)])
 
-    def _better(self, m: int, values: NDArray[np.float64]) -> int:
-        """Return move ``m`` if the futures show that it is better than the first one, else 0.
-
-        It has to be better by :data:`CERTAINTY` standard errors, in the futures that both had.
-        """
-        gains = values[:, m] - values[:, 0]
-        gains = gains[~np.isnan(gains)]
-        if len(gains) < FEWEST:
-            return 0
-        error = gains.std(ddof=1) / math.sqrt(len(gains))
-        return m if gains.mean() > CERTAINTY * error else 0
+    @staticmethod
+    def _better(m: int, values: NDArray[np.float64]) -> int:
+        """Return move ``m`` if it was tried in enough futures to trust the result, else 0."""
+        return m if np.isfinite(values[:, m]).sum() >= FEWEST else 0
 
 
 class _Trial:

@@ -62,7 +62,6 @@ REASONS = {
     "unknown_weight": "the bin has a weight limit, and a weight is unknown",
     "other_order": "the open bin belongs to another order, and no more bins may be opened",
     "full": "the bin holds as many boxes as it may",
-    "no_space": "it fits nowhere between the boxes",
     "too_tall": "it would reach above the bin wherever it fits",
     "no_support": "nowhere would it stand by the rule and the margin",
     "load": "it would have to rest on boxes that may not carry it",

@@ -81,7 +81,7 @@ def of_line(text: str, number: int, spec: ExactSpec) -> Arrival | Refused | None
             raise ValueError(f"{source}: needs at most {LONGEST_LINE} characters")
         try:
             content = json.loads(text, parse_constant=_no_constant)
-        except (json.JSONDecodeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{source}: not readable as JSON ({one_line(str(error))})") from None
         record = check_record(content, source, leave_out=("quantity",))
         keys = {attribute.key: attribute.column for attribute in GOODS_ATTRIBUTES}
