@@ -23,6 +23,10 @@ from .geometry import ORIENTATIONS as ORIENTATIONS
 from .items import Items as Items
 from .items import Stream as Stream
 from .items import make_stream as make_stream
+from .packer.answers import NoPlace as NoPlace
+from .packer.answers import Placement as Placement
+from .packer.packer import Packer as Packer
+from .packer.poses import Pose as Pose
 from .plan import Plan as Plan
 from .sapien_check import Stack as Stack
 from .sapien_check import check as check

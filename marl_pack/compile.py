@@ -137,6 +137,18 @@ def _millimetres() -> None:
             game.plan(0)
 
 
+def _packer() -> None:
+    """Pack boxes one by one with each kind of policy, and report where one was put."""
+    from marl_pack.packer.packer import Packer
+
+    boxes = [(300, 200, 250), (400, 300, 200), (200, 200, 200), (390, 290, 110)] * 3
+    for policy, plan in (("max_contact", None), ("search", "budget=20ms"), ("rs", None)):
+        packer = Packer((500, 400, 600), policy, plan=plan, clearance_mm=10)
+        for box in boxes:
+            if packer.place(box):
+                packer.actual((*packer.placements[-1].centre[:2], 0.5))
+
+
 PARTS: dict[str, Callable[[], None]] = {
     "rules": _rules,
     "games": _games,
@@ -145,6 +157,7 @@ PARTS: dict[str, Callable[[], None]] = {
     "agents": _agents,
     "environments": _environments,
     "millimetres": _millimetres,
+    "packer": _packer,
     "training": _training,
 }
 """The parts of the package whose code is compiled, by name."""

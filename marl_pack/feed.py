@@ -26,7 +26,7 @@ from marl_pack.packer.packer import Packer
 from marl_pack.packer.reasons import why_not
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import save_plan
-from marl_pack.terminal import make_progress
+from marl_pack.terminal import make_progress, make_status
 
 SHOWN = 20  # boxes without a place that are listed
 
@@ -142,6 +142,25 @@ def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
         if feed.stopped:
             break
     return refused
+
+
+def save_pictures(feed: Feed, console: Console) -> None:
+    """Draw each bin to a file of its own."""
+    from marl_pack.render.animation import save_gif
+    from marl_pack.render.picture import draw_plan, save
+
+    plan, path = feed.packer.plan, feed.chosen.picture
+    count = len(plan.bin_sizes)
+    with make_status(console, "drawing"):
+        for k in range(count):
+            file = path if count == 1 else path.with_stem(f"{path.stem}-{k}")
+            packed = plan.in_bin(k)
+            title = f"{feed.chosen.policy}, bin {k}: {len(packed)} boxes"
+            if path.suffix.lower() == ".gif":
+                save_gif(file, packed, title)
+            else:
+                save(file, draw_plan(packed, f"{title}, {packed.utilization:.1%} filled"))
+    console.print(f"pictures: {path}" + (f" (-0 … -{count - 1})" if count > 1 else ""))
 
 
 def show(feed: Feed, console: Console) -> None:

@@ -21,6 +21,7 @@ from marl_pack.options import MM_POLICIES, NEXT_BIN, NO_PLACE
 from marl_pack.plan_archive import check_ending
 from marl_pack.terminal import Parser, announce_compiling, make_console
 
+PICTURES = (".png", ".gif")
 PROGRAM = "python -m marl_pack.pack"
 NOTE = """\
 columns of a file, keys of a line: w_mm, d_mm, h_mm; and, if you like, id, quantity, weight_kg,
@@ -84,6 +85,9 @@ def parser(program: str = PROGRAM) -> Parser:
         metavar="FILE",
         help="write the plan to this .json, .csv or .npz file while boxes are packed",
     )
+    add("--picture", type=Path, metavar="FILE",
+        help="draw the packed bin (.png), or how it was packed (.gif); with several bins, one file "
+             "each, FILE-0, FILE-1, …")  # fmt: skip
     add("--state", type=Path, metavar="FILE",
         help="with -: save the packer to this .json file before each answer; if the file exists, "
              "go on from there")  # fmt: skip
@@ -103,7 +107,9 @@ def run(chosen: argparse.Namespace) -> int:
         raise ValueError("--state: only with -, for a conveyor")
     if chosen.out is not None:
         check_ending(chosen.out, "--out")
-    for path in (chosen.out, chosen.state):
+    if chosen.picture is not None and chosen.picture.suffix.lower() not in PICTURES:
+        raise ValueError(f"--picture {chosen.picture}: needs the ending .png or .gif")
+    for path in (chosen.out, chosen.state, chosen.picture):
         if path is not None:
             check_writable(path)
     announce_compiling(console)
@@ -118,6 +124,8 @@ def run(chosen: argparse.Namespace) -> int:
     finally:
         if feeding.times:
             feed.show(feeding, console)
+    if chosen.picture is not None:
+        feed.save_pictures(feeding, console)
     return refused
 
 

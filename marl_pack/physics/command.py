@@ -28,8 +28,13 @@ from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.files import Growing, check_writable, write_json
 from marl_pack.options import MOST_AT_ONCE
 from marl_pack.physics import controls, table1, trials
-from marl_pack.physics.options import add_file_options, chosen_bodies, chosen_episodes
-from marl_pack.plan_archive import load_plans, save_plans
+from marl_pack.physics.options import (
+    add_file_options,
+    chosen_bodies,
+    chosen_episodes,
+    load_stacks,
+)
+from marl_pack.plan_archive import save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, Verdict, judge_all
 from marl_pack.sapien_check.stack import Stack
@@ -209,7 +214,7 @@ def show_controls(
 
 def run_stack(options: argparse.Namespace, console: Console) -> None:
     """Draw one saved packing (``--render``), judge packings, and print and write the verdicts."""
-    plans = load_plans(options.file)
+    plans = load_stacks(options.file)
     bodies = chosen_bodies(options)
     chosen = chosen_episodes(options, plans)
     if options.render is not None:

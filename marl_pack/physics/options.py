@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from marl_pack.plan import Plan
+from marl_pack.plan_archive import load_plans
 from marl_pack.sapien_check.bodies import Bodies
 
 BODY_OPTIONS = ("cell", "density", "com_spread")
@@ -40,13 +41,26 @@ def chosen_bodies(options: argparse.Namespace) -> Bodies:
 def add_file_options(parser: argparse.ArgumentParser) -> None:
     """Add the file of packings, ``--episodes``, and the options of their bodies to a command."""
     parser.add_argument(
-        "file", type=Path, help="a file written by evaluate --save-stacks or play --save"
+        "file", type=Path, help="a file written by pack, evaluate --save-stacks or play --save"
     )
     parser.add_argument(
         "--episodes", nargs="+", type=int, metavar="K",
-        help="numbers of the episodes to judge (default: all)",
+        help="numbers of the episodes to judge (default: all); each bin of a plan is one",
     )  # fmt: skip
     add_body_options(parser.add_argument_group("bodies"))
+
+
+def load_stacks(path: Path) -> list[Plan]:
+    """Read a file of plans; return one plan for each bin, in order.
+
+    Raises:
+        ValueError: if the file is of another kind, or has an impossible value.
+    """
+    return [
+        plan if len(plan.bin_sizes) == 1 else plan.in_bin(k)
+        for plan in load_plans(path)
+        for k in range(len(plan.bin_sizes))
+    ]
 
 
 def chosen_episodes(options: argparse.Namespace, plans: Sequence[Plan]) -> Sequence[int]:

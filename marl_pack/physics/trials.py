@@ -22,8 +22,12 @@ from marl_pack.checks import whole_number
 from marl_pack.evaluation.statistics import FEWEST, interval, share_interval, spread
 from marl_pack.files import Growing, write_json
 from marl_pack.physics import trial_controls
-from marl_pack.physics.options import add_file_options, chosen_bodies, chosen_episodes
-from marl_pack.plan_archive import load_plans
+from marl_pack.physics.options import (
+    add_file_options,
+    chosen_bodies,
+    chosen_episodes,
+    load_stacks,
+)
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.trials import Trial, TrialResult, run_trials
 from marl_pack.sapien_check.world import DEFAULT, SimulationError
@@ -87,7 +91,7 @@ def run(options: argparse.Namespace, console: Console) -> None:
     """Run trials of saved packings; print a summary and the first collapses, and write all."""
     whole_number(options.repeats, "--repeats", 1, MOST_REPEATS)
     trial = chosen_trial(options)
-    plans = load_plans(options.file)
+    plans = load_stacks(options.file)
     bodies = chosen_bodies(options)
     numbers = [(e, r) for e in chosen_episodes(options, plans) for r in range(options.repeats)]
     stacks = ((bodies.stack(plans[e], e), e, r) for e, r in numbers)

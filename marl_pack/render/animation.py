@@ -11,7 +11,7 @@ from PIL import Image
 
 from marl_pack.files import write_atomically
 from marl_pack.plan import Plan
-from marl_pack.render.picture import draw
+from marl_pack.render.picture import draw, drawable
 
 PIXELS = (720, 480)
 SECONDS, LAST_SECONDS = 0.6, 3.0
@@ -24,16 +24,23 @@ def frames(plan: Plan, title: str = "") -> Iterator[NDArray[np.uint8]]:
     The box that comes next is drawn beside the bin, as it will be placed.
 
     Args:
-        plan: the boxes of one bin, in whole cells.
+        plan: the boxes of one bin.
         title: the title of each picture, before the number of boxes and the utilization.
     """
-    boxes, (size,) = plan.boxes, plan.bin_sizes.tolist()
+    whole = drawable(plan)
+    boxes = whole.boxes
     for count in range(len(boxes) + 1):
-        following = boxes[count, 3:].tolist() if count < len(boxes) else None
+        following = None
+        if count < len(boxes):
+            w, d, h = boxes[count, 3:].tolist()
+            following = (w, d, h)
         filled = plan.first(count).utilization
         caption = f"{title}: " if title else ""
         caption += f"box {count} of {len(boxes)}, {filled:.0%} of the bin filled"
-        yield draw(size, boxes[:count], following, title=caption, pixels=PIXELS, leave_space=True)
+        yield draw(
+            whole.size, boxes[:count], following, title=caption, pixels=PIXELS, leave_space=True,
+            parts=whole.parts,
+        )  # fmt: skip
 
 
 def save_gif(path: Path, plan: Plan, title: str = "") -> None:
@@ -41,7 +48,7 @@ def save_gif(path: Path, plan: Plan, title: str = "") -> None:
 
     Args:
         path: the file to write.
-        plan: the boxes of one bin, in whole cells.
+        plan: the boxes of one bin.
         title: the title of each frame.
 
     Raises:

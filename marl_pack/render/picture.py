@@ -9,6 +9,7 @@ or any other global state, so pictures can be drawn in any thread or process.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.files import moved_into_place
+from marl_pack.plan import Plan
 
 PALETTE: tuple[str, ...] = (
     "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
@@ -122,6 +124,42 @@ def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
     return order
 
 
+@dataclass(frozen=True)
+class Drawable:
+    """A plan of one bin in whole numbers, as :func:`draw` needs it."""
+
+    size: tuple[int, int, int]
+    boxes: NDArray[np.int64]  # [n, 6]
+    parts: int  # the numbers are this many times the plan's
+
+
+def drawable(plan: Plan) -> Drawable:
+    """Return a plan of one bin in whole numbers; a box with a yaw is drawn without it, smaller.
+
+    Raises:
+        ValueError: for a plan of several bins, or lengths of more than four decimals.
+    """
+    if len(plan.bin_sizes) != 1:
+        raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: needs one, plan.in_bin(k)")
+    boxes, size = plan.boxes.astype(np.float64), plan.bin_sizes[0].astype(np.float64)
+    turned = plan.yaws != 0
+    around = (plan.extents[1] - plan.extents[0])[turned, :2] - boxes[turned, 3:5]
+    boxes[turned, :2] = np.ceil(boxes[turned, :2] + around / 2)
+    boxes[turned, 3:5] = np.floor(boxes[turned, 3:5] - around - 1)
+    for parts in (1, 10, 100, 1000, 10_000):
+        whole, whole_size = np.round(boxes * parts), np.round(size * parts)
+        if np.allclose(whole, boxes * parts, atol=1e-6) and (whole_size == size * parts).all():
+            w, d, h = whole_size.astype(int).tolist()
+            return Drawable((w, d, h), whole.astype(np.int64), parts)
+    raise ValueError("a picture needs lengths of at most four decimals")
+
+
+def draw_plan(plan: Plan, title: str = "") -> NDArray[np.uint8]:
+    """Draw a plan of one bin (:func:`draw`)."""
+    whole = drawable(plan)
+    return draw(whole.size, whole.boxes, title=title, parts=whole.parts)
+
+
 def draw(
     size: tuple[int, int, int],
     boxes: NDArray[np.integer],
@@ -131,6 +169,7 @@ def draw(
     title: str = "",
     pixels: tuple[int, int] = (960, 600),
     leave_space: bool = False,
+    parts: int = 1,
 ) -> NDArray[np.uint8]:
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
@@ -148,6 +187,7 @@ def draw(
         pixels: (columns, rows) of the picture.
         leave_space: whether to leave space for an item even without one, so that the bin is at
             the same place in every picture.
+        parts: the numbers on the picture are lengths divided by this.
 
     Returns:
         uint8 [rows, columns, 3], RGB.
@@ -168,10 +208,10 @@ def draw(
     beside = 0.28 if masks is None else 0.18
     left = 0.05 if item is None and not leave_space else beside + 0.04
     right = 0.93 if masks is None else 0.61
-    scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked)
+    scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked, parts)
     if item is not None:
         colour = PALETTE[len(boxes) % len(PALETTE)]
-        _draw_item(figure, (0.01, 0.36, beside, 0.40), item, colour, scale)
+        _draw_item(figure, (0.01, 0.36, beside, 0.40), item, colour, scale, parts)
     if masks is not None:
         legend = "green: where the item's low corner may lie"
         figure.text(0.01, 0.02, legend, size=9, color=LEGAL)
@@ -230,7 +270,11 @@ def _check(
 
 
 def _draw_bin(
-    figure: Figure, rect: _Rect, size: tuple[int, int, int], boxes: NDArray[np.int64]
+    figure: Figure,
+    rect: _Rect,
+    size: tuple[int, int, int],
+    boxes: NDArray[np.int64],
+    parts: int,
 ) -> float:
     """Draw the bin in 3D so that it fills ``rect``, and return its scale in pixels per cell."""
     axes, scale = _axes(figure, rect, size)
@@ -251,7 +295,7 @@ def _draw_bin(
         side = size[axis]
         # Each scale begins where the previous one ends, so only the first has a 0.
         ticks = sorted({0, side // 2, side} if name == "x" else {side // 2, side} - {0})
-        marks = [(float(tick), str(tick), 9, 8) for tick in ticks]
+        marks = [(float(tick), f"{tick / parts:g}", 9, 8) for tick in ticks]
         for at, text, away, letters in [*marks, (side / 2, name, 22, 10)]:
             right, up = _project(origins[axis] + at * np.eye(3)[axis])
             axes.annotate(
@@ -269,12 +313,17 @@ def _draw_bin(
 
 
 def _draw_item(
-    figure: Figure, rect: _Rect, item: tuple[int, int, int], colour: str, scale: float
+    figure: Figure,
+    rect: _Rect,
+    item: tuple[int, int, int],
+    colour: str,
+    scale: float,
+    parts: int,
 ) -> None:
     """Draw the item to come in the middle of ``rect``, with its sides below."""
     axes, own_scale = _axes(figure, rect, item, scale)
     _add_boxes(axes, np.array([(0, 0, 0, *item)]), [colour], last_edge=0.6)
-    text = "item {} × {} × {}".format(*item)
+    text = "item {:g} × {:g} × {:g}".format(*(side / parts for side in item))
     if own_scale < 0.99 * scale:
         text += f"\n(drawn at {own_scale / scale:.0%})"
     left, bottom, width, _ = rect
