@@ -7,13 +7,16 @@ from the goods (``cases``: they follow the order of the half of the picks that t
 in).
 Searches stop by the clock, so faster machines have higher figures.
 
-``poses`` are packings by ``linear`` in which each box is put down with an error, which is told to
-the packer; a trial then builds them as they are (:mod:`marl_pack.sapien_check.trials`).
+``answers`` are the times of ``marl-pack pack -``; ``orders`` are packed onto pallets. ``poses`` are
+packings by ``linear`` in which each box is put down with an error, which is reported to the packer;
+a trial then builds them as they are (:mod:`marl_pack.sapien_check.trials`).
 """
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -35,13 +38,16 @@ from experiments.real_goods import (
     make_stream,
     play,
     read,
+    read_rows,
     spec_of,
 )
 from experiments.rows import Rows, main_of, mean
+from marl_pack import pack as pack_command
 from marl_pack.evaluation.rollout import Rollout
 from marl_pack.evaluation.statistics import mean_utilization, share_interval
 from marl_pack.exact.futures import Catalogue, Futures, History
 from marl_pack.exact.lengths import to_mm
+from marl_pack.files import write_csv
 from marl_pack.packer.answers import Placement
 from marl_pack.packer.packer import Packer
 from marl_pack.plan import Plan
@@ -242,6 +248,105 @@ def pack_exactly(stream: str, episode: int) -> Plan:
     return packer.plan
 
 
+# --- answers and orders ---------------------------------------------------------------------------
+
+PALLET = ("--bin-mm", "1200", "800", "1500", "--margin-mm", "20")
+CASES = ((400, 300, 250, 8.2), (395, 295, 285, 11.5), (300, 200, 180, 4.1), (600, 400, 320, 16.0),
+         (330, 250, 140, 3.3), (285, 190, 160, 2.2))  # fmt: skip
+"""Mixed cases: sides in mm and kilograms. Some stay upright, the last are not stackable."""
+ANSWERED = 60
+ORDERS = {
+    "bed_bpp": ("--bin-mm", "1200", "800", "2000", "--margin-mm", "20"),
+    "two_pallets": PALLET,
+}
+"""Options of the pallets of each set of orders."""
+
+
+def case_rows() -> list[dict[str, Any]]:
+    """Return 60 mixed cases in runs of equal ones, as lines of a conveyor have them."""
+    generator = np.random.default_rng(7)
+    rows: list[dict[str, Any]] = []
+    while len(rows) < ANSWERED:
+        kind, count = int(generator.integers(len(CASES))), int(generator.integers(1, 5))
+        w, d, h, kilograms = CASES[kind]
+        for _ in range(min(count, ANSWERED - len(rows))):
+            rows.append({
+                "id": f"case {kind}-{len(rows)}", "w_mm": w, "d_mm": d, "h_mm": h,
+                "weight_kg": kilograms, "upright": kind in (1, 3), "stackable": kind != 5,
+            })  # fmt: skip
+    return rows
+
+
+def measure_answers(policy: str) -> dict[str, Any]:
+    """Measure the time of each answer of ``marl-pack pack -``, which also writes the plan."""
+    text = "".join(json.dumps(row) + "\n" for row in case_rows())
+    PLANS.mkdir(parents=True, exist_ok=True)
+    out = PLANS / f"answers_{policy}.json"
+    command = [sys.executable, "-m", "marl_pack.pack", "-", "--policy", policy, *PALLET, "--out",
+               str(out)]  # fmt: skip
+    for _ in range(2):  # the first run may compile code
+        run = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    times = [json.loads(line)["ms"] for line in run.stdout.splitlines()]
+    plan = Plan.from_json(out)
+    return {
+        "boxes": len(times), "packed": len(plan), "bins": len(plan.bin_sizes),
+        "first_bin": plan.in_bin(0).utilization, "median_ms": float(np.median(times)),
+        "worst_ms": max(times),
+    }  # fmt: skip
+
+
+def orders_file(name: str) -> Path:
+    """Return a file of orders: BED-BPP's, or three orders of the picks that need two pallets."""
+    folder = Path(os.environ["MARL_PACK_DATA"]) / "real"
+    if name == "bed_bpp":
+        return folder / "orders_bed_bpp.json"
+    path = PLANS / "two_pallets.csv"
+    orders: dict[str, list[dict[str, str]]] = {}
+    for row in read_rows("cases"):
+        orders.setdefault(row["order"], []).append(row)
+    chosen: list[dict[str, str]] = []
+    for order, rows in orders.items():
+        packer = Packer((1200, 800, 1500), margin_mm=20, bins=3)
+        fits = all(
+            packer.place(
+                [float(row[f"{side}_mm"]) for side in "wdh"], weight=float(row["weight_kg"]),
+                upright=True, order=order,
+            )
+            for row in rows
+            for _ in range(int(row["quantity"]))
+        )  # fmt: skip
+        if fits and packer.state.bins == 2:
+            chosen += [{**row, "upright": "yes"} for row in rows]
+            if len({row["order"] for row in chosen}) == 3:
+                break
+    PLANS.mkdir(parents=True, exist_ok=True)
+    write_csv(path, [list(chosen[0]), *(list(row.values()) for row in chosen)])
+    return path
+
+
+def measure_orders(name: str, policy: str) -> dict[str, Any]:
+    """Pack orders with ``marl-pack pack``; return the bins of each order."""
+    out = PLANS / f"{name}_{policy}.json"
+    words = [str(orders_file(name)), "--policy", policy, *ORDERS[name], "--out", str(out)]
+    if policy == "search":
+        words += ["--plan", f"budget={BUDGETS[0]}ms"]
+    if pack_command.main(words):
+        raise ValueError(f"{name}: could not be packed")
+    plan = Plan.from_json(out)
+    bins = []
+    for k, order in enumerate(plan.orders):
+        packed = plan.in_bin(k)
+        width, depth, _ = packed.bin_sizes[0].tolist()
+        top = float((packed.positions + packed.sides)[:, 2].max())
+        volume = float(packed.sides.astype(np.float64).prod(1).sum())
+        bins.append({
+            "order": order, "boxes": len(packed), "utilization": packed.utilization,
+            "height_mm": top, "fill": volume / (width * depth * top),
+            "kilograms": float(packed.weights.sum()),
+        })  # fmt: skip
+    return {"bins": bins, "left_out": len(plan.left_out)}
+
+
 # --- rows -----------------------------------------------------------------------------------------
 
 
@@ -256,11 +361,20 @@ def keys() -> Iterator[str]:
     for stream in BINS:
         yield f"{stream} trial"
     yield "mix poses"
+    for policy in ("max_contact", "linear", "rs"):
+        yield f"answers {policy}"
+    for name in ORDERS:
+        for policy in ("max_contact", "linear", "search"):
+            yield f"orders {name} {policy}"
 
 
 def measure(key: str, processes: int) -> dict[str, Any]:
     """Measure one row."""
-    stream, kind, *_ = key.split()
+    stream, kind, *rest = key.split()
+    if stream == "answers":
+        return measure_answers(kind)
+    if stream == "orders":
+        return measure_orders(kind, *rest)
     if kind == "trial":
         return measure_trial(stream, processes)
     if kind == "poses":

@@ -21,7 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
 from docs.pages import between
 from docs.pages import table as markdown_table
-from experiments import ablations, packing, physics, planning, real_cell, real_goods
+from experiments import ablations, packer, packing, physics, planning, real_cell, real_goods
 from experiments.rows import main_of, mean
 from marl_pack.files import write_atomically
 from marl_pack.physics import table1
@@ -167,10 +167,44 @@ def render_real_cell(folder: Path = RESULTS) -> str:
     )  # fmt: skip
 
 
+def render_packer(folder: Path = RESULTS) -> str:
+    """Return the text of docs/packer_results.md; the arguments are those of :func:`render`."""
+    tables = tables_in(folder)
+    row = tables["packer"].row
+    budgets = [f"search budget={budget}ms" for budget in reversed(packer.BUDGETS)]
+    heuristics = ("max_contact", "linear", "tuned")
+    equal = [row(f"{stream} {name}")["equal"] for stream in real_goods.BINS for name in heuristics]
+
+    def order_rows(orders: str, policy: str) -> Iterable[dict[str, Any]]:
+        figures = row(f"orders {orders} {policy}")
+        names = list(dict.fromkeys(each["order"] for each in figures["bins"]))
+        for name in names:
+            bins = [each for each in figures["bins"] if each["order"] == name]
+            yield {
+                "order": name, "pallets": len(bins), "boxes": sum(b["boxes"] for b in bins),
+                "left_out": figures["left_out"],
+                "fill": ", ".join(percent(b["fill"], 1) for b in bins),
+                "height": ", ".join(f"{b['height_mm']:g}" for b in bins),
+            }  # fmt: skip
+
+    return template("packer").render(
+        made=lambda name: made(tables[name]), streams=real_goods.BINS,
+        policies=(*heuristics, *budgets), equal=f"{sum(equal)} of {len(equal)} rows are equal",
+        figures=lambda stream, policy: row(f"{stream} {policy}"), utilization=utilization,
+        budget=packer.BUDGETS[0], trial=lambda stream: row(f"{stream} trial"),
+        poses=row("mix poses"), clearance=f"{packer.CLEARANCE:g}",
+        place_error=f"{packer.PLACE_ERROR:g}", yaw=f"{packer.YAW:g}",
+        order_sets=packer.ORDERS, order_policies=("max_contact", "linear", "search"),
+        order_rows=order_rows, answer_policies=("max_contact", "linear", "rs"),
+        answers=lambda policy: row(f"answers {policy}"),
+    )  # fmt: skip
+
+
 PAGES = {
     PAGE: render,
     PAGE.with_name("real_goods.md"): render_real_goods,
     PAGE.with_name("real_cell.md"): render_real_cell,
+    PAGE.with_name("packer_results.md"): render_packer,
 }
 """Every page of results, with the function that makes its text."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-DOCS = ("physics", "environment", "items", "many_bins", "millimetres", "stability")
+DOCS = ("physics", "environment", "items", "many_bins", "millimetres", "packer", "stability")
 PAGES = ("README.md", *(f"docs/{page}.md" for page in DOCS))
 EXAMPLES = [
     code
