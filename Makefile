@@ -29,7 +29,7 @@ check: test
 
 bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
-	  tests/test_exact_game.py tests/test_exact_rules.py tests/test_items.py tests/test_packing.py \
+	  tests/test_exact_game.py tests/test_exact_rules.py tests/test_exact_search.py tests/test_items.py tests/test_packing.py \
 	  tests/test_stability_rules.py tests/test_stability_properties.py
 
 fuzz: $(STAMP)  ## bad and hard input at random, for MINUTES=20

@@ -56,9 +56,10 @@ from marl_pack.sapien_check.stack import Stack
 from marl_pack.sapien_check.trials import Trial, TrialResult, run_trials
 from marl_pack.sapien_check.world import SimulationError
 
-BUDGETS = (500, 200, 100, 50)
-"""Milliseconds of a decision; those below 500 are measured on :data:`FEW` episodes."""
-FEW = 50
+BUDGETS = (500, 100)
+"""Milliseconds of a decision."""
+SEARCHED = 60
+"""Episodes of a search at most, the first ones of a stream."""
 PLANS = ROOT / "build" / "packer"
 """Folder of the packings by search, which the trials build."""
 TRIAL = Trial(place_error=0.002, yaw=0.3, drop=0.002, size_error=0.01)
@@ -123,8 +124,8 @@ def play_stream(
 ) -> tuple[list[Plan], list[float]]:
     """Pack all episodes of a row, in several processes."""
     count = episodes_of(stream)
-    if plan is not None and plan != f"budget={BUDGETS[0]}ms":
-        count = min(count, FEW)
+    if plan is not None:
+        count = min(count, SEARCHED)
     pack(stream, policy, None if plan is None else "budget=1ms", 0)  # compiles the code
     task = partial(pack, stream, policy, plan)
     if processes == 1:

@@ -48,7 +48,7 @@ def parser(program: str = PROGRAM) -> Parser:
              f"FILE.py:NAME (default: {MM_POLICIES[0]})")  # fmt: skip
     add("--plan", metavar="budget=T,top=M",
         help="search before each placement: T is a time such as 500ms, M the number of moves to "
-             "try (default: budget=500ms,top=16)")  # fmt: skip
+             "try (default: budget=500ms,top=6)")  # fmt: skip
     add("--catalogue", type=Path, metavar="FILE",
         help="a file of goods from which the search draws the boxes to come (default: those shown "
              "so far)")  # fmt: skip

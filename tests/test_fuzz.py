@@ -12,6 +12,7 @@ from fuzz.program import (
     attempt,
     games,
     millimetres,
+    packers,
 )
 
 
@@ -30,6 +31,12 @@ def test_random_games_equal_plain_code(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_random_games_in_millimetres_pass_plain_checks(tmp_path: Path) -> None:
     for name, case in islice(millimetres(seed=5, folder=tmp_path), 25):
+        outcome, detail = attempt(case)
+        assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
+
+
+def test_random_calls_of_packers_pass_plain_checks(tmp_path: Path) -> None:
+    for name, case in islice(packers(seed=4, folder=tmp_path), 10):
         outcome, detail = attempt(case)
         assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
 

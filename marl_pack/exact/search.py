@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from marl_pack.exact.packing import ExactPacking
 
 MILLISECOND = 1_000_000  # nanoseconds
+CERTAINTY = 0.5
+"""Standard errors by which a move has to be better than the one with the best score."""
 FEWEST = 6
-"""Futures in which a move has to be tried to replace the one with the best score."""
+"""Futures that this needs at least."""
 SHARE = 8
 """So many futures there should be time for, for each move that is tried."""
 
@@ -209,8 +211,17 @@ class Search:
 
     @staticmethod
     def _better(m: int, values: NDArray[np.float64]) -> int:
-        """Return move ``m`` if it was tried in enough futures to trust the result, else 0."""
-        return m if np.isfinite(values[:, m]).sum() >= FEWEST else 0
+        """Return move ``m`` if the futures show that it is better than the first one, else 0.
+
+        It has to be better by :data:`CERTAINTY` standard errors, in the futures that both had: the
+        score that ranks the moves is right more often than a few futures.
+        """
+        gains = values[:, m] - values[:, 0]
+        gains = gains[np.isfinite(gains)]
+        if len(gains) < FEWEST:
+            return 0
+        error = gains.std(ddof=1) / math.sqrt(len(gains))
+        return m if gains.mean() > CERTAINTY * error else 0
 
 
 class _Trial:

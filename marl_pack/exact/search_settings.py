@@ -27,7 +27,7 @@ class ExactSearchSettings:
     """
 
     budget_ms: float = 500.0
-    top: int = 16
+    top: int = 6
     futures: int | None = None
 
     def __post_init__(self) -> None:

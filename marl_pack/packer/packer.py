@@ -464,9 +464,8 @@ class Packer:
         bins = {len(self.packed) - 1: self.bin} if fits_order else {}
         if not empty and more and (self.open_next or not fits_order):
             bins[len(self.packed)] = ExactBins(1, self.spec)
-        history = joined([*self._shown, item], self.spec.unit_mm)
         for k, bin in bins.items():
-            turn = Turn(bin, item, history)
+            turn = Turn(bin, item, self._shown)
             move = int(self.policy(turn)[0]) if turn.alive[0] else -1
             if move < 0:
                 continue

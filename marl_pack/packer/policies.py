@@ -47,7 +47,7 @@ class SeededMoves:
 
     def __call__(self, turn: Turn) -> NDArray[np.int64]:
         """Return one of the legal moves, int64 [1]."""
-        generator = np.random.default_rng((self.seed, len(turn.history)))
+        generator = np.random.default_rng((self.seed, turn.number))
         moves: NDArray[np.int64] = RandomMoves(generator)(turn)  # type: ignore[arg-type]
         return moves
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.exact.bins import ExactBins, ListedMoves
-from marl_pack.exact.goods import Goods
+from marl_pack.exact.goods import Goods, joined
 from marl_pack.exact.spec import ExactSpec
 
 
@@ -19,7 +20,7 @@ class Turn:
 
     bins: ExactBins  # one bin
     items: Goods  # the visible box, one row
-    history: Goods  # all boxes shown so far, in order; the visible one is the last
+    before: Sequence[Goods] = ()  # the boxes that came before it, one row each
 
     @property
     def spec(self) -> ExactSpec:
@@ -41,6 +42,11 @@ class Turn:
         """The legal moves of the visible box."""
         return self.bins.moves(self.items, self.alive)
 
+    @property
+    def number(self) -> int:
+        """Number of boxes shown so far, the visible one included."""
+        return len(self.before) + 1
+
     def shown(self, g: int) -> Goods:
-        """Return the boxes shown so far; ``g`` is 0."""
-        return self.history
+        """Return the boxes shown so far, in order; the visible one is the last. ``g`` is 0."""
+        return joined([*self.before, self.items], self.spec.unit_mm)

@@ -90,6 +90,14 @@ def millimetres(seed: int, folder: Path) -> Iterator[Case]:
         yield name, lambda case=case: _done(case())
 
 
+def packers(seed: int, folder: Path) -> Iterator[Case]:
+    """Yield packers with random calls, checked by plain code."""
+    from .packer import cases
+
+    for name, case in cases(seed):
+        yield name, lambda case=case: _done(case())
+
+
 def item_files(seed: int, folder: Path) -> Iterator[Case]:
     """Yield files of items, and play the first turn with those that are taken."""
     from marl_pack.game.packing import Packing
@@ -169,8 +177,8 @@ def checkpoints(seed: int, folder: Path) -> Iterator[Case]:
 SOURCES: dict[str, Callable[[int, Path], Iterator[Case]]] = {
     source.__name__: source
     for source in (
-        arguments, settings, item_files, plan_files, checkpoints, games, millimetres, hull_rules,
-        equilibria,
+        arguments, settings, item_files, plan_files, checkpoints, games, millimetres, packers,
+        hull_rules, equilibria,
     )
 }  # fmt: skip
 
