@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -13,6 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from marl_pack.agents.sources import is_own
+from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.streams import read_orders
 from marl_pack.files import Growing
@@ -22,6 +24,7 @@ from marl_pack.options import NEXT_BIN, STOP
 from marl_pack.packer.answers import NoPlace, Placement
 from marl_pack.packer.calls import goods_of
 from marl_pack.packer.conveyor import Arrival, Refused, of_line, of_orders
+from marl_pack.packer.packed import Packed
 from marl_pack.packer.packer import Packer
 from marl_pack.packer.reasons import why_not
 from marl_pack.plan import Plan
@@ -29,6 +32,7 @@ from marl_pack.plan_archive import save_plan
 from marl_pack.terminal import make_progress, make_status
 
 SHOWN = 20  # boxes without a place that are listed
+TINY = 10  # times that the longest side of all boxes goes into the bin's shortest: a wrong unit?
 
 
 class Feed:
@@ -43,7 +47,8 @@ class Feed:
         spec = ExactSpec.of(given_options(chosen, ExactSpec))
         arguments: dict[str, Any] = {
             "spec": spec, "policy": chosen.policy, "plan": chosen.plan,
-            "catalogue": chosen.catalogue, "grid_mm": chosen.grid_mm, "seed": chosen.seed,
+            "catalogue": None if chosen.catalogue is None else str(chosen.catalogue),
+            "grid_mm": chosen.grid_mm, "seed": chosen.seed,
             "bins": chosen.bins, "open_next": chosen.no_place == NEXT_BIN,
         }  # fmt: skip
         if chosen.present is not None:
@@ -53,8 +58,10 @@ class Feed:
             arguments["present"] = read(chosen.present)
         self.packer = Packer(**arguments)
         if chosen.state is not None and chosen.state.exists():
-            saved = Packer.restore(chosen.state)
-            if saved.spec != spec or saved.arguments != self.packer.arguments:
+            own = {"policy": chosen.policy} if is_own(chosen.policy) else {}
+            saved = Packer.restore(chosen.state, **own)
+            same = saved.spec == spec and saved.arguments == self.packer.arguments
+            if not (same and saved.present.same(self.packer.present)):
                 raise ValueError(f"--state {chosen.state}: was saved with other options")
             self.packer = saved
         self.times: list[float] = []  # seconds of each answer
@@ -78,7 +85,7 @@ def _warm_up(arguments: dict[str, Any]) -> None:
     """Run all code once, so that the first box does not wait while it is compiled or loaded."""
     plan = {"plan": "budget=1ms"} if arguments["plan"] or arguments["policy"] == "search" else {}
     packer = Packer(**{**arguments, **plan})
-    side = min(packer.spec.bin_mm) // 3 or min(packer.spec.bin_mm)
+    side = float(to_mm(max(1, min(packer.spec.size) // 3), packer.spec.unit_mm))
     for _ in range(3):
         packer.place((side, side, side), weight=1.0)
     why_not(packer.bin, goods_of((side, side, side), {}, packer.spec))
@@ -163,6 +170,17 @@ def save_pictures(feed: Feed, console: Console) -> None:
     console.print(f"pictures: {path}" + (f" (-0 … -{count - 1})" if count > 1 else ""))
 
 
+def _count(number: int, one: str, many: str) -> str:
+    """Return a number with its noun."""
+    return f"{number} {one if number == 1 else many}"
+
+
+def _weight(kilograms: float, boxes: Sequence[Packed]) -> str:
+    """Return the known weight of a bin, and how many weights are unknown."""
+    unknown = sum(bool(np.isnan(box.item.weights[0])) for box in boxes)
+    return f"{kilograms:.1f} kg" + (f", {unknown} unknown" if unknown else "")
+
+
 def show(feed: Feed, console: Console) -> None:
     """Print what was packed, and what had no place and why."""
     state, orders = feed.packer.state, feed.packer.orders
@@ -177,18 +195,21 @@ def show(feed: Feed, console: Console) -> None:
         fill = state.utilization[k] * volume / (area * top) if top else 0.0
         row = [
             str(state.boxes[k]), f"{state.utilization[k]:.1%}", f"{fill:.1%}",
-            f"{state.weight[k]:.1f} kg", f"{top:g} mm",
+            _weight(state.weight[k], boxes), f"{top:g} mm",
         ]  # fmt: skip
         table.add_row(str(k), *([orders[k]] if any(orders) else []), *row)
     console.print(f"{feed.chosen.policy}, {feed.packer.spec}", soft_wrap=True)
     console.print(table)
-    words = [f"{sum(state.boxes)} boxes in {state.bins} bins"]
+    words = [f"{_count(sum(state.boxes), 'box', 'boxes')} in {_count(state.bins, 'bin', 'bins')}"]
     if state.least_margin is not None:
         words.append(f"least margin {state.least_margin:g} mm")
     if feed.times:
         times = np.array(feed.times) * 1000
         words.append(f"{np.median(times):.2f} ms a box, at most {times.max():.1f} ms")
     console.print(", ".join(words), soft_wrap=True)
+    longest = [max(p.w, p.d, p.h) for p in feed.packer.placements]
+    if longest and max(longest) * TINY < min(feed.packer.spec.bin_mm):
+        console.print(f"all boxes are shorter than {max(longest):g} mm: are their sizes in mm?")
     left_out = state.left_out
     for box in left_out[:SHOWN]:
         sides = " x ".join(f"{side:g}" for side in box.sides)

@@ -46,7 +46,7 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file; refuse an object that has a key twice."""
     text = read_text(path)
     try:
-        return json.loads(text, object_pairs_hook=_object)
+        return json.loads(text, object_pairs_hook=unique_keys)
     except RecursionError:
         reason = "it is nested too deeply"
     except (json.JSONDecodeError, KeyError) as error:
@@ -56,7 +56,7 @@ def read_json(path: Path) -> Any:
     raise ValueError(f"{path}: not readable as JSON ({reason})")
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object; raise KeyError for a key that is given twice."""
     content: dict[str, Any] = {}
     for key, value in pairs:

@@ -240,8 +240,11 @@ def test_lines_that_are_not_boxes_are_answered_and_left_out(
         '{"w_mm": 1, "d_mm": 1, "h_mm": 1, "quantity": 2}': "unknown key 'quantity'",
         '{"w_mm": NaN, "d_mm": 1, "h_mm": 1}': "NaN is not a number",
         '{"w_mm": 0, "d_mm": 1, "h_mm": 1}': "zero or negative",
-        '{"w_mm": "a", "d_mm": 1, "h_mm": 1}': "three numbers",
+        '{"w_mm": "a", "d_mm": 1, "h_mm": 1}': "needs three lengths",
         '{"w_mm": 1e999, "d_mm": 1, "h_mm": 1}': "finite",
+        '{"w_mm": true, "d_mm": 1, "h_mm": 1}': "needs three lengths",
+        '{"w_mm": 1, "w_mm": 2, "d_mm": 1, "h_mm": 1}': "the key 'w_mm' is given twice",
+        '{"w_mm": 1, "d_mm": 1, "h_mm": 1, "order": 1, "sequence": 1}': "which mean the same",
         "{" * 100_000: "needs at most 65536 characters",
         "[" * 5000: "not readable as JSON",
     }
@@ -280,6 +283,21 @@ def test_a_conveyor_goes_on_from_its_state(
     assert read_plan(out) == whole
     status, _, summary = conveyor("", [*words, "--margin-mm", "3"], monkeypatch, capsys)
     assert (status, "was saved with other options" in summary) == (2, True)
+
+
+def test_units_and_catalogues_go_with_states(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    catalogue = tmp_path / "goods.csv"
+    catalogue.write_text("w_mm,d_mm,h_mm\n100,100,100\n300,200,100\n")
+    words = ["--state", str(tmp_path / "state.json"), "--policy", "search", "--unit-mm", "10",
+             "--plan", "budget=1ms", "--catalogue", str(catalogue)]  # fmt: skip
+    text = '{"w_mm": 300, "d_mm": 200, "h_mm": 100}'
+    for count in (1, 2):
+        status, answers, _ = conveyor(text, words, monkeypatch, capsys)
+        assert (status, len(answers)) == (0, 1)
+        saved = json.loads((tmp_path / "state.json").read_text())
+        assert len(saved["calls"]) == count
 
 
 @pytest.mark.parametrize("killed_after", [1, 6])

@@ -245,6 +245,19 @@ def test_a_changed_file_is_refused(tmp_path: Path) -> None:
     refuses(lambda c: c.update(version=7), "version 7: needs 1")
     refuses(lambda c: c.pop("calls"), "no key 'calls'")
     refuses(lambda c: c["options"].update(rule="hull"), "hull")
+    refuses(lambda c: c["calls"].append({"call": "next_bin"}), "all 1 bins are open or closed")
+    refuses(lambda c: c["calls"][3].update(order="B"), "its placement is not legal")
+    refuses(lambda c: c["calls"].append({**c["calls"][0], "bin": 1}), "all 1 bins")
+    refuses(lambda c: c["options"].update(orientations=[5]), "orientation")
+    refuses(lambda c: c.update(not_saved=[[1]]), "was not saved")
+    refuses(lambda c: c["calls"].append({"call": ["place"]}), "needs an object whose call")
+    refuses(
+        lambda c: c["calls"].append(
+            {"call": "skip", "box": c["calls"][0]["box"], "code": [], "reason": ""}
+        ),
+        "needs one of the codes",
+    )
+    refuses(lambda c: c["present"].append({"box": 5, "row": [0, 0, 0, 1, 1, 1]}), "present: needs")
 
 
 def test_a_function_has_to_be_given_again(tmp_path: Path) -> None:
@@ -258,6 +271,17 @@ def test_a_function_has_to_be_given_again(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="policy was not saved: restore needs it"):
         Packer.restore(tmp_path / "saved.json")
     assert Packer.restore(tmp_path / "saved.json", policy=first).placements == (answer,)
+
+
+def test_reading_a_file_runs_no_code_that_it_names(tmp_path: Path) -> None:
+    source = tmp_path / "mine.py"
+    source.write_text("def policy(turn):\n    return turn.moves.of(0)[:1]\n")
+    packer = Packer(BIN, f"{source}:policy")
+    packer.place((300, 200, 100))
+    packer.save(tmp_path / "saved.json")
+    with pytest.raises(ValueError, match="policy was not saved"):
+        Packer.restore(tmp_path / "saved.json")
+    assert Packer.restore(tmp_path / "saved.json", policy=f"{source}:policy").plan == packer.plan
 
 
 def test_a_policy_that_breaks_the_rule_is_stopped() -> None:
@@ -332,14 +356,46 @@ def test_each_order_begins_in_a_new_bin() -> None:
     assert packer.plan.orders == ("order 0", "order 1", "order 2")
 
 
+def test_a_function_that_chooses_nothing_is_named_as_the_reason() -> None:
+    assert reason(Packer(BIN, lambda turn: np.array([-1])), (10, 10, 10)) == "policy"
+    assert reason(Packer(BIN, level_tolerance_mm=5), (100, 100, 4), upright=True) == "too_thin"
+
+
+def test_boxes_of_a_plan_keep_their_limits_when_they_are_there_already(tmp_path: Path) -> None:
+    packer = Packer((300, 300, 300), rule="hull_1")
+    packer.place((300, 300, 100), stackable=False, id="a")
+    again = Packer((300, 300, 300), rule="hull_1", present=packer.plan)
+    assert reason(again, (100, 100, 50)) == "load"
+    packer = Packer((300, 300, 300))
+    packer.place((300, 300, 100))  # its weight is assumed
+    again = Packer((300, 300, 300), present=packer.plan)
+    assert again.plan.weights_assumed.tolist() == [True]
+    with pytest.raises(ValueError, match="need weights, because max_weight_kg is set"):
+        Packer((300, 300, 300), present=packer.plan, max_weight_kg=100)
+    packer = Packer((400, 400, 300), clearance_mm=20)
+    first = packer.place((100, 100, 100))
+    assert isinstance(first, Placement)
+    packer.actual((*first.centre[:2], 3.0))
+    with pytest.raises(ValueError, match="box 0 has a yaw"):
+        Packer((400, 400, 300), present=packer.plan)
+
+
+def test_an_order_may_begin_on_boxes_that_are_there_already() -> None:
+    packer = Packer(BIN, present=[[0, 0, 0, 100, 100, 100]])
+    assert packer.place((100, 100, 100), order="A")
+    assert reason(packer, (100, 100, 100), order="B") == "other_order"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"sides": (True, 10, 10)}, "needs three lengths w, d, h in mm"),
+        ({"sides": (10, 10, 10), "id": "a\0"}, "needs a text or a whole number"),
         ({"sides": (0, 10, 10)}, "zero or negative; needs sides > 0 mm"),
         ({"sides": (-5, 10, 10)}, "zero or negative"),
         ({"sides": (float("nan"), 10, 10)}, "needs finite numbers"),
         ({"sides": (10, 10)}, "needs three lengths w, d, h in mm"),
-        ({"sides": ("10", 10, 10)}, "three numbers"),
+        ({"sides": ("10", 10, 10)}, "needs three lengths w, d, h in mm"),
         ({"sides": (10.05, 10, 10)}, "needs whole units of 0.1 mm"),
         ({"sides": (10, 10, 10), "wieght": 3}, "'wieght'; did you mean 'weight'"),
         ({"sides": (10, 10, 10), "weight": -3}, "weight_kg -3; needs a positive number"),

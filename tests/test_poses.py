@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -137,6 +138,57 @@ def test_impossible_poses_are_refused_and_change_nothing() -> None:
         with pytest.raises(ValueError, match=message):
             packer.actual(pose)
         assert (packer.state, packer.plan) == before
+
+
+def test_a_box_that_nothing_carries_has_no_margin() -> None:
+    """A bridge is rotated so far that the rectangle inside it reaches neither pier."""
+    piers = [[0, 0, 0, 60, 300, 100], [340, 0, 0, 60, 300, 100]]
+    packer = Packer((600, 300, 300), "dblf", rule="hull_1", present=piers, orientations=(0,))
+    bridge = packer.place((400, 100, 190), id="bridge")
+    assert isinstance(bridge, Placement)
+    assert bridge.z == 100
+    actual = packer.actual((bridge.centre[0] + 10, 150, 15))
+    assert (actual.margin, actual.support) == (None, 0.0)
+    assert actual.problem
+    assert json.loads(json.dumps(actual.to_dict(), allow_nan=False))["margin"] is None
+    assert np.isnan(packer.plan.margins[2])
+    assert packer.state.least_margin is None
+    assert Plan.of_dict(packer.plan.to_dict(), "plan") == packer.plan
+
+
+def test_limits_hold_in_the_space_of_a_rotated_box() -> None:
+    """The rectangle that carries is smaller than the box, but nothing may touch the box."""
+    packer = Packer((400, 400, 300), "dblf", rule="none", orientations=(0,), clearance_mm=60)
+    first = packer.place((200, 40, 100), stackable=False)
+    assert isinstance(first, Placement)
+    packer.actual((200, 200, 35))
+    around, inside = rectangles(2000, 2000, 2000, 400, 35)
+    corner = np.array([[around[2] - 300, around[3] - 300]])  # outside of the inner rectangle
+    assert (corner[0] > inside[2:]).all()
+    item = packer._goods((100, 100, 100), {})
+    assert len(packer.bin.moves_at(0, item, corner)) == 0
+
+
+def test_thin_boxes_and_coarse_units() -> None:
+    packer = Packer((600, 300, 300), "dblf", unit_mm=10, rule="hull_1", orientations=(0,),
+                    present=[[0, 0, 0, 600, 300, 100]])  # fmt: skip
+    plank = packer.place((100, 10, 200))
+    assert isinstance(plank, Placement)
+    assert plank.z == 100
+    actual = packer.actual((300, 150, 45))
+    assert (actual.support, actual.margin) == (0.0, None)
+    packer.undo()
+    assert packer.placements[-1] == plank
+
+
+def test_a_second_report_replaces_the_first() -> None:
+    packer = Packer((600, 300, 300), rule="none", policy=lambda t: t.moves.of(0)[-1:],
+                    orientations=(0,), present=[[0, 0, 0, 200, 200, 100]])  # fmt: skip
+    top = packer.place((200, 100, 50))
+    assert isinstance(top, Placement)
+    assert top.z == 100
+    assert packer.actual((450, 150)).z == 0
+    assert packer.actual(top.centre[:2]).z == 100
 
 
 def test_a_box_that_lost_its_support_rests_lower() -> None:

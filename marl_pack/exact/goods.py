@@ -84,6 +84,10 @@ class Goods:
         return self.sides.astype(np.float64).prod(-1)
 
 
+class ThinError(ValueError):
+    """A box is lower than the level tolerance."""
+
+
 class Lines(str):
     """The name of a file whose rows have numbers of lines, for messages."""
 
@@ -226,10 +230,14 @@ def fitting(goods: Goods, spec: ExactSpec, rows: NDArray[Any], source: str) -> G
         "orientations",
     )  # fmt: skip
     thin = (fits & (placed[:, :, 2] <= spec.limits().tolerance)).any(1)
-    _refuse(
-        thin & (spec.level_tolerance_mm > 0), rows, source,
-        f"lower than level_tolerance_mm = {spec.level_tolerance_mm:g}; needs a smaller tolerance",
-    )  # fmt: skip
+    try:
+        _refuse(
+            thin & (spec.level_tolerance_mm > 0), rows, source,
+            f"lower than level_tolerance_mm = {spec.level_tolerance_mm:g}; needs a smaller "
+            "tolerance",
+        )  # fmt: skip
+    except ValueError as error:
+        raise ThinError(str(error)) from None
     return replace(goods, orientations=allowed)
 
 

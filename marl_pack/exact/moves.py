@@ -218,6 +218,24 @@ def _rest(strip: Any, m: int, y: int, d: int, gap: int) -> int:
 
 
 @njit(cache=True, inline="always")
+def rests_on_blocked(
+    limits: Limits, boxes: Any, n: int, blocked: Any, x: int, y: int, z: int, w: int, d: int
+) -> bool:
+    """Return whether a footprint at height ``z`` touches a box on which it may not rest.
+
+    The space of rotated boxes counts, not the rectangle that carries.
+    """
+    if z == 0:
+        return False
+    for j in range(n):
+        if blocked[j] and 0 <= z - boxes[j, 2] - boxes[j, 5] <= limits.tolerance:
+            x0, y0, x1, y1 = shared(boxes, j, x, y, w, d)
+            if x0 < x1 and y0 < y1:
+                return True
+    return False
+
+
+@njit(cache=True, inline="always")
 def stands(
     limits: Limits, boxes: Any, n: int, starts: Any, parts: Any, blocked: Any, item: Any,
     scratch: Scratch, move: int,
@@ -238,10 +256,9 @@ def stands(
     w, d = item[AXES[o, 0]], item[AXES[o, 1]]
     k = 0
     if z > 0:
+        if rests_on_blocked(limits, boxes, n, blocked, x, y, z, w, d):
+            return NO
         k = find_contacts(boxes, n, x, y, z, w, d, limits.tolerance, scratch.touching)
-        for t in range(k):
-            if blocked[scratch.touching[t]]:
-                return NO
     return verdict(limits, boxes, starts, parts, scratch, k, x, y, z, w, d)
 
 

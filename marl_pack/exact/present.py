@@ -25,6 +25,10 @@ class Present:
     rows: NDArray[np.int64]  # [k, 6]  x, y, z, w, d, h in units, as placed
     goods: Goods  # [k]  their weights and limits
 
+    def same(self, other: Present) -> bool:
+        """Return whether the boxes are the same."""
+        return np.array_equal(self.rows, other.rows) and self.goods.same(other.goods)
+
 
 def check_present(
     boxes: Any, spec: ExactSpec, attributes: Mapping[str, Any] | None = None
@@ -35,8 +39,7 @@ def check_present(
         boxes: numbers [k, 6], rows x, y, z, w, d, h in millimetres; or a plan of one bin with a
             unit, whose weights are in kilograms; or a mapping with ``boxes`` (one of these) and
             attributes by key, such as ``weights``, ``stackable`` and ``max_load``
-            (:data:`marl_pack.exact.goods.GOODS_ATTRIBUTES`). A plan does not say whether boxes are
-            stackable, and how much they may carry.
+            (:data:`marl_pack.exact.goods.GOODS_ATTRIBUTES`).
         spec: the game. The boxes need not satisfy its rule, margin or clearance.
         attributes: attributes of the boxes, as in a mapping.
 
@@ -51,7 +54,12 @@ def check_present(
     if isinstance(boxes, Plan):
         if boxes.unit_mm is None or len(boxes.bin_sizes) != 1:
             raise ValueError(f"{NAME}: needs a plan of one bin with unit_mm, not {boxes}")
-        attributes = {"weights": boxes.weights} | dict(attributes or {})
+        if boxes.yaws.any():
+            raise ValueError(
+                f"{NAME}: box {int((boxes.yaws != 0).argmax())} has a yaw; needs boxes along the "
+                "axes (a saved Packer keeps rotated boxes)"
+            )
+        attributes = _attributes(boxes) | dict(attributes or {})
         boxes = boxes.boxes_mm
     rows = number_rows(boxes, 6, NAME, "x y z w d h in mm")
     if not (attributes is None or isinstance(attributes, Mapping)):
@@ -75,6 +83,16 @@ def check_present(
     for k, i in enumerate(order.tolist()):
         _check_box(i, units, order[:k].tolist(), spec.size, tolerance, rows[i].tolist())
     return Present(units[order], goods[order])
+
+
+def _attributes(plan: Plan) -> dict[str, list[Any]]:
+    """Return what a plan says of its boxes; weights that were assumed are unknown."""
+    weights = zip(plan.weights.tolist(), plan.weights_assumed.tolist(), strict=True)
+    return {
+        "weights": [None if assumed else weight for weight, assumed in weights],
+        "stackable": plan.stackable.tolist(),
+        "max_load": [None if np.isinf(load) else load for load in plan.max_loads.tolist()],
+    }
 
 
 def _check_box(

@@ -242,6 +242,8 @@ def verdict(
     if z == 0:
         on_floor = limits.rule >= HULL_1 and limits.margin_on_floor
         return YES if not on_floor or 2 * margin < min(w, d) * SCALE else NO
+    if k == 0:  # only corners of rotated boxes are under it
+        return NO
     if not _within_overhang(limits, boxes, scratch.touching, k, x, y, w, d):
         return NO
     if limits.rule == NONE:

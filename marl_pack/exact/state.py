@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marl_pack.exact.limits import CARRIES, EQUILIBRIUM, HULL_ALPHA, LBCP, ROW, Limits
-from marl_pack.exact.rules import carrying_part, find_contacts, make_scratch
+from marl_pack.exact.rules import carrying_part, find_contacts, make_scratch, shared
 from marl_pack.installation import njit
 
 ROUNDING = 1e-12
@@ -101,10 +101,13 @@ def add_box(
     below = state.below[b]
     below[n] = 0
     for t in range(k):
-        j = scratch.touching[t]
-        grounded &= state.grounded[b, j]
-        below[n] |= below[j]
-        below[n, j // 64] |= np.uint64(1) << np.uint64(j % 64)
+        grounded &= state.grounded[b, scratch.touching[t]]
+    for j in range(n):  # in the space of rotated boxes, not only where they carry
+        x0, y0, x1, y1 = shared(boxes, j, new[0], new[1], new[3], new[4])
+        touches = x0 < x1 and y0 < y1 and 0 <= z - boxes[j, 2] - boxes[j, 5] <= limits.tolerance
+        if touches:
+            below[n] |= below[j]
+            below[n, j // 64] |= np.uint64(1) << np.uint64(j % 64)
     for j in range(n):
         if (below[n, j // 64] >> np.uint64(j % 64)) & np.uint64(1):
             state.carried[b, j] += weight if known else np.inf

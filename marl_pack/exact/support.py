@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from marl_pack.exact import balance
 from marl_pack.exact.bins import ExactBins
 from marl_pack.exact.limits import AREA_RATIO, CARRIES, EQUILIBRIUM, HULL_1, NONE, SCALE, Limits
-from marl_pack.exact.moves import encode
+from marl_pack.exact.moves import encode, rests_on_blocked
 from marl_pack.exact.polygons import convex_hull
 from marl_pack.exact.rules import (
+    NO,
     OPEN,
     YES,
     carried_by,
@@ -29,7 +30,8 @@ class Support(NamedTuple):
     """How a box is supported from below."""
 
     share: float  # of its footprint that rests on the floor or on boxes, 0 … 1
-    margin: float  # distance of the centre of mass from the edge of its support, units; < 0: beyond
+    margin: float  # distance of the centre of mass from the edge of its support, units; < 0:
+    # beyond it; NaN: nothing carries
     stands: bool  # whether the rule allows it there, with its margin
 
 
@@ -44,6 +46,8 @@ def _measure(
     """
     z, x, y = row[2], row[CARRIES], row[CARRIES + 1]
     w, d = row[CARRIES + 2] - x, row[CARRIES + 3] - y
+    if w <= 0 or d <= 0:  # a thin box that was rotated
+        return (1.0 if z == 0 else 0.0), np.nan, NO
     scratch = make_scratch(n, starts[n])
     k = 0
     if z > 0:
@@ -55,12 +59,12 @@ def _measure(
     for t in range(k):
         x0, y0, x1, y1 = carried_by(boxes, scratch.touching[t], x, y, w, d)
         area += float(x1 - x0) * (y1 - y0)
-        if blocked[scratch.touching[t]]:
-            answer = 0
+    if rests_on_blocked(limits, boxes, n, blocked, row[0], row[1], z, row[3], row[4]):
+        answer = NO
     size, _ = gather(rule, boxes, starts, parts, scratch, k, x, y, w, d)
     corners = convex_hull(scratch.points, size, scratch.hull)
     if corners < 3:
-        return area / (float(w) * d), -np.inf, answer
+        return area / (float(w) * d), np.nan, answer
     margin = np.inf
     middle_x, middle_y = SCALE * (x + w / 2.0), SCALE * (y + d / 2.0)
     for i in range(corners):

@@ -134,9 +134,9 @@ def _orientation_mask(value: Any) -> NDArray[np.bool_]:
 
 
 def _is_text(text: str) -> bool:
-    """Return whether a text can be an id: not empty, not too long, and writable as UTF-8."""
-    surrogate = any("\ud800" <= character <= "\udfff" for character in text)
-    return 0 < len(text) <= LONGEST_ID and not surrogate
+    """Return whether a text can be an id: not empty or too long, no control characters, UTF-8."""
+    wrong = any("\ud800" <= c <= "\udfff" or c < " " or c == "\x7f" for c in text)
+    return 0 < len(text) <= LONGEST_ID and not wrong
 
 
 def _id(value: Any) -> str | int:

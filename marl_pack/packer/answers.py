@@ -21,7 +21,8 @@ class Placement:
     h: float
     centre: tuple[float, float, float]  # middle of the box in the bin
     support: float  # share of the footprint that rests on the floor or on boxes, 0 … 1
-    margin: float  # distance of the centre of mass from the edge of its support
+    margin: float | None  # distance of the centre of mass from the edge of its support; None if
+    # nothing carries the box
     yaw: float = 0.0  # rotation about the vertical, degrees; only if the robot reported it
     problem: str = ""  # why a reported pose breaks the rule; "" if it does not
 
@@ -58,6 +59,8 @@ class NoPlace:
 
 REASONS = {
     "too_large": "larger than the empty bin in every orientation that it may take",
+    "too_thin": "lower than the level tolerance",
+    "policy": "the policy chose no place, though there is one",
     "too_heavy": "the bin would become heavier than it may be",
     "unknown_weight": "the bin has a weight limit, and a weight is unknown",
     "other_order": "the open bin belongs to another order, and no more bins may be opened",

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from marl_pack.agents.sources import is_own
 from marl_pack.checks import shown, whole_number
 from marl_pack.exact.bins import placements
 from marl_pack.exact.goods import DEFAULTS, KEYS, Goods, check_goods
@@ -82,7 +84,12 @@ def goods_of(sides: Any, attributes: Mapping[str, Any], spec: ExactSpec) -> Good
     values = {
         BOX_ATTRIBUTES[key]: [value] for key, value in attributes.items() if value is not None
     }
-    if not isinstance(sides, Sequence | np.ndarray) or isinstance(sides, str) or len(sides) != 3:
+    listed = isinstance(sides, Sequence | np.ndarray) and not isinstance(sides, str)
+    if (
+        not listed
+        or len(sides) != 3
+        or any(isinstance(s, bool | np.bool_) or not isinstance(s, Real) for s in sides)
+    ):
         raise ValueError(f"box: {shown(sides)}: needs three lengths w, d, h in mm")
     return check_goods([list(sides)], spec, values, source="box", fit=False)
 
@@ -137,7 +144,7 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
         "place": ("box", "bin", "orientation", "units", "order"), "actual": ("pose",),
         "skip": ("box", "code", "reason"), "next_bin": (),
     }  # fmt: skip
-    if not isinstance(row, dict) or row.get("call") not in keys:
+    if not isinstance(row, dict) or row.get("call") not in list(keys):
         raise ValueError(f"call {shown(row)}: needs an object whose call is one of {[*keys]}")
     needed = ("call", *keys[row["call"]])
     check_names(row, needed, needed, f"call {row['call']}", "key")
@@ -154,7 +161,7 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
     if row["call"] == "actual":
         return Reported(Pose.of(row["pose"]))
     if row["call"] == "skip":
-        if row["code"] not in REASONS or not isinstance(row["reason"], str):
+        if row["code"] not in list(REASONS) or not isinstance(row["reason"], str):
             raise ValueError(f"call skip: needs one of the codes {', '.join(REASONS)}, and a text")
         return Skipped(_goods(row["box"], spec), row["code"], row["reason"])
     return Opened()
@@ -170,7 +177,8 @@ def to_dict(
 
     Args:
         spec: its options.
-        arguments: its other arguments; those that are not numbers or texts are not saved.
+        arguments: its other arguments; those that are not numbers or texts are not saved, nor is
+            a policy ``FILE.py:NAME``, so that reading a file never runs code that it names.
         present: the boxes that were in the first bin.
         done: its calls.
     """
@@ -180,7 +188,7 @@ def to_dict(
     plain = {
         key: value
         for key, value in texts.items()
-        if value is None or isinstance(value, str | int | float)
+        if (value is None or isinstance(value, str | int | float)) and not is_own(value)
     }
     boxes = [
         {"box": _box(present.goods[[k]]), "row": to_mm(row, spec.unit_mm).tolist()}
@@ -225,7 +233,11 @@ def _present(rows: Sequence[Any]) -> dict[str, Any]:
     boxes: dict[str, list[Any]] = {"boxes": []}
     attributes = [key for key in BOX_ATTRIBUTES.items() if key[1] in KEYS]
     for row in rows:
-        if not isinstance(row, dict) or set(row) != {"box", "row"}:
+        if (
+            not isinstance(row, dict)
+            or set(row) != {"box", "row"}
+            or not isinstance(row["box"], dict)
+        ):
             raise ValueError("present: needs objects with the keys box and row")
         boxes["boxes"].append(row["row"])
         for name, key in attributes:
@@ -245,6 +257,6 @@ def complete(made: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """
     made = dict(made)
     for name in made.pop("not_saved"):
-        if name not in given:
+        if name not in list(given):
             raise ValueError(f"{name} was not saved: restore needs it")
     return {**made, **given}

@@ -12,6 +12,7 @@ from marl_pack.exact.goods import GOODS_ATTRIBUTES, Goods
 from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.streams import SIDES, Order, check_record
+from marl_pack.inputs import unique_keys
 from marl_pack.packer.calls import BOX_ATTRIBUTES, goods_of
 
 LONGEST_LINE = 1 << 16
@@ -80,10 +81,12 @@ def of_line(text: str, number: int, spec: ExactSpec) -> Arrival | Refused | None
         if len(text) > LONGEST_LINE:
             raise ValueError(f"{source}: needs at most {LONGEST_LINE} characters")
         try:
-            content = json.loads(text, parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
+            content = json.loads(text, parse_constant=_no_constant, object_pairs_hook=unique_keys)
+        except (ValueError, KeyError, RecursionError) as error:
             raise ValueError(f"{source}: not readable as JSON ({one_line(str(error))})") from None
         record = check_record(content, source, leave_out=("quantity",))
+        if {"order", "sequence"} <= set(record):
+            raise ValueError(f"{source}: has order and sequence, which mean the same")
         keys = {attribute.key: attribute.column for attribute in GOODS_ATTRIBUTES}
         attributes = {
             name: record[keys[key]]

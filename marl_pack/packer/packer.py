@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
 from marl_pack.exact.bins import ExactBins, placements
-from marl_pack.exact.goods import AXES, Goods, fitting, joined
+from marl_pack.exact.goods import AXES, Goods, ThinError, fitting, joined
 from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.present import Present, check_present
 from marl_pack.exact.spec import ExactSpec
@@ -23,25 +23,14 @@ from marl_pack.option_record import document
 from marl_pack.packer import calls
 from marl_pack.packer.answers import NoPlace, Placement
 from marl_pack.packer.calls import Call, Opened, Placed, Reported, Skipped
+from marl_pack.packer.packed import Packed, row_at
 from marl_pack.packer.policies import PackerPolicy, make_packer_policy
-from marl_pack.packer.poses import Pose, overlap, rectangles
+from marl_pack.packer.poses import Pose
 from marl_pack.packer.reasons import why_not
 from marl_pack.packer.turn import Turn
 from marl_pack.plan import LeftOut, Plan
 
-TOUCHING = 0.5
-"""Units by which reported poses may overlap: they are rounded to whole units."""
 MOST_BINS = 1_000_000
-
-
-@dataclass(frozen=True)
-class Packed:
-    """A box in a bin, in units."""
-
-    item: Goods  # one row
-    placement: Placement
-    row: NDArray[np.int64]  # [10]  its row in the bin's state
-    middle: tuple[float, float]  # x, y
 
 
 @dataclass(frozen=True)
@@ -84,7 +73,7 @@ class Packer:
             ``marl-pack tune``, a published model such as ``"rs"``, a run's folder or a checkpoint,
             or a function (:class:`marl_pack.exact.policies.ExactPolicy`).
         spec: the options; by default ``ExactSpec()``.
-        bins: largest number of bins; None for any number.
+        bins: largest number of bins, one by default; None for any number.
         open_next: whether the next bin is opened when a box has no place in the open one.
         present: boxes that are in the first bin already
             (:func:`marl_pack.exact.present.check_present`).
@@ -217,10 +206,6 @@ class Packer:
         Raises:
             ValueError: if the open bin is empty, or no more bins may be opened.
         """
-        if not self.packed[-1]:
-            raise ValueError("next_bin: the open bin is empty")
-        if self.most_bins is not None and len(self.packed) >= self.most_bins:
-            raise ValueError(f"next_bin: all {self.most_bins} bins are open or closed")
         self._do(Opened())
         return len(self.packed) - 1
 
@@ -265,7 +250,7 @@ class Packer:
     def state(self) -> PackerState:
         """What the packer has done so far."""
         volume = self.bin.volume
-        margins = [p.margin for p in self.placements if p.z > 0]
+        margins = [p.margin for p in self.placements if p.z > 0 and p.margin is not None]
         return PackerState(
             len(self.packed),
             tuple(len(bin) for bin in self.packed),
@@ -299,7 +284,7 @@ class Packer:
             weights_assumed=~known,
             stackable=items.stackable, max_loads=items.max_load,
             supports=np.array([p.support for p in placed]),
-            margins=np.array([p.margin for p in placed]),
+            margins=np.array([np.nan if p.margin is None else p.margin for p in placed]),
             left_out=tuple(self.left_out),
             orders=tuple(self.orders) if any(self.orders) else (),
         )  # fmt: skip
@@ -371,69 +356,81 @@ class Packer:
             name = str(call.item.ids[0])
             self.left_out.append(LeftOut(name, (sides[0], sides[1], sides[2]), call.reason))
         else:
+            self._check_next()
             self._open_bin()
 
     def _apply_placed(self, call: Placed) -> None:
         """Place a box in the open bin, or in the next one."""
-        if call.bin == len(self.packed) and self.packed[-1]:
+        opens = call.bin == len(self.packed)
+        wrong = ValueError(f"box {str(call.item.ids[0])!r}: its placement is not legal")
+        if opens:
+            self._check_next()
+        elif call.bin != len(self.packed) - 1 or not self._fits_order(call.order):
+            raise wrong
+        item = fitting(call.item, self.spec, to_mm(call.item.sides, self.spec.unit_mm), "box")
+        bin = ExactBins(1, self.spec) if opens else self.bin
+        if not bin.legal(item, np.array([call.move]))[0]:
+            raise wrong
+        if opens:
             self._open_bin()
-        move = np.array([call.move])
-        if call.bin != len(self.packed) - 1 or not self.bin.legal(call.item, move)[0]:
-            raise ValueError(f"box {str(call.item.ids[0])!r}: its placement is not legal")
         self.orders[-1] = call.order
-        row = _row_of(call.item, call.move)
-        answer = self._answer(call.item, row, call.move & 7, self._support(call.item, row))
-        self._shown.append(call.item)
-        self._add(call.item, row, answer)
+        row = _row_of(item, call.move)
+        answer = self._answer(item, row, call.move & 7, self._support(item, row))
+        self._shown.append(item)
+        self._add(item, row, answer)
 
-    def _add(self, item: Goods, row: NDArray[np.int64], answer: Placement) -> None:
+    def _check_next(self) -> None:
+        """Refuse to open the next bin if the open one is empty, or all bins are used.
+
+        Raises:
+            ValueError: saying which.
+        """
+        if not self.packed[-1]:
+            raise ValueError("next_bin: the open bin is empty")
+        if self.most_bins is not None and len(self.packed) >= self.most_bins:
+            raise ValueError(
+                f"next_bin: all {self.most_bins} bins are open or closed (bins = "
+                f"{self.most_bins}; None allows any number)"
+            )
+
+    def _fits_order(self, order: str) -> bool:
+        """Return whether a box of an order may be placed in the open bin."""
+        begun = len(self.packed[-1]) > (len(self.present.rows) if len(self.packed) == 1 else 0)
+        return not begun or self.orders[-1] == order
+
+    def _add(
+        self, item: Goods, row: NDArray[np.int64], answer: Placement,
+        planned: Placement | None = None,
+    ) -> None:  # fmt: skip
         """Add a box at a row to the open bin."""
         self.bin.add(row[None], item, np.ones(1, np.bool_))
         unit = self.spec.unit_mm
         middle = answer.centre[0] / unit, answer.centre[1] / unit
-        self.packed[-1].append(Packed(item, answer, row, middle))
+        self.packed[-1].append(Packed(item, answer, planned or answer, row, middle))
 
     def _apply_reported(self, pose: Pose) -> None:
         """Move the last box of the open bin to the pose that a robot reported."""
-        bin, unit = self.packed[-1], self.spec.unit_mm
-        if not bin or (len(bin) == len(self.present.rows) and len(self.packed) == 1):
+        unit = self.spec.unit_mm
+        if len(self.packed[-1]) <= (len(self.present.rows) if len(self.packed) == 1 else 0):
             raise ValueError("actual: no box was placed in the open bin")
-        *others, last = bin
-        planned = last.placement
-        x, y = pose.x / unit, pose.y / unit
-        w, d, h = (round(side / unit) for side in (planned.w, planned.d, planned.h))
-        around, inside = rectangles(x, y, w, d, pose.yaw)
-        if (around[:2] < 0).any() or (around[2:] > self.bin.size[:2]).any():
-            raise ValueError(f"actual: box {planned.id!r} would reach out of the bin at {pose}")
-        shape = x, y, w, d, pose.yaw
-        z = 0
+        *others, last = self.packed[-1]
+        planned = last.planned
+        row = row_at(pose, planned, others, self.bin.size, unit)
+        without = ExactBins(1, self.spec)
         for box in others:
-            top = int(box.row[2] + box.row[5])
-            if top <= round(planned.z / unit) and overlap(shape, _shape(box, unit)) > TOUCHING:
-                z = max(z, top)
-        for box in others:
-            low, high = int(box.row[2]), int(box.row[2] + box.row[5])
-            depth = overlap(shape, _shape(box, unit))
-            if low < z + h and high > z and depth > TOUCHING:
-                raise ValueError(
-                    f"actual: box {planned.id!r} would overlap box {box.placement.id!r} by "
-                    f"{depth * unit:.1f} mm at {pose}"
-                )
-        # The bin without the box, then with it at its pose.
-        self.bin = ExactBins(1, self.spec)
-        for box in others:
-            self.bin.add(box.row[None], box.item, np.ones(1, np.bool_))
-        bin.pop()
-        row = np.array((*around[:2], z, *(around[2:] - around[:2]), h, *inside), np.int64)
-        support = self._support(last.item, row)
+            without.add(box.row[None], box.item, np.ones(1, np.bool_))
+        weight = float(without.weights_of(last.item)[0][0])
+        support = measure(without, row, weight, without.blocked(0, last.item))
+        z = float(to_mm(row[2], unit))
         answer = Placement(
             planned.id, planned.bin, planned.orientation, pose.x - planned.w / 2,
-            pose.y - planned.d / 2, float(to_mm(z, unit)), planned.w, planned.d, planned.h,
-            (pose.x, pose.y, float(to_mm(z, unit)) + planned.h / 2), support.share,
-            float(to_mm(support.margin, unit)), pose.yaw,
+            pose.y - planned.d / 2, z, planned.w, planned.d, planned.h,
+            (pose.x, pose.y, z + planned.h / 2), support.share, _margin(support, unit), pose.yaw,
             "" if support.stands else f"it does not stand there by the rule {self.spec.rule}",
         )  # fmt: skip
-        self._add(last.item, row, answer)
+        self.bin = without
+        self.packed[-1] = others
+        self._add(last.item, row, answer, planned)
 
     # --- offers -----------------------------------------------------------------------------------
 
@@ -450,8 +447,13 @@ class Packer:
             raise ValueError(f"order {shown(order)}: needs a text")
         try:
             able = fitting(item, self.spec, to_mm(item.sides, self.spec.unit_mm), "box")
-        except ValueError as error:
-            self._offered = _Offer(item, order, item, _no(item, "too_large", str(error)))
+        except ThinError:
+            reason = f"it is lower than level_tolerance_mm = {self.spec.level_tolerance_mm:g}"
+            self._offered = _Offer(item, order, item, _no(item, "too_thin", reason))
+        except ValueError:
+            size = " x ".join(f"{side:g}" for side in self.spec.bin_mm)
+            reason = f"it fits into an empty bin of {size} mm in no orientation that it may take"
+            self._offered = _Offer(item, order, item, _no(item, "too_large", reason))
         else:
             self._offered = _Offer(item, order, able, *self._choose(able, order))
         return self._offered
@@ -460,7 +462,7 @@ class Packer:
         """Choose a place in the open bin or, if there is none, in the next one."""
         more = self.most_bins is None or len(self.packed) < self.most_bins
         empty = not self.packed[-1]
-        fits_order = empty or self.orders[-1] == order
+        fits_order = self._fits_order(order)
         bins = {len(self.packed) - 1: self.bin} if fits_order else {}
         if not empty and more and (self.open_next or not fits_order):
             bins[len(self.packed)] = ExactBins(1, self.spec)
@@ -493,7 +495,7 @@ class Packer:
         return Placement(
             str(item.ids[0]), len(self.packed) - 1 if bin is None else bin, orientation, x, y, z, w,
             d, h, (x + w / 2, y + d / 2, z + h / 2), support.share,
-            float(to_mm(support.margin, self.spec.unit_mm)),
+            _margin(support, self.spec.unit_mm),
         )  # fmt: skip
 
 
@@ -502,10 +504,9 @@ def _no(item: Goods, code: str, reason: str) -> NoPlace:
     return NoPlace(str(item.ids[0]), code, reason)
 
 
-def _shape(box: Packed, unit: float) -> tuple[float, float, float, float, float]:
-    """Return middle, sides and yaw of a box seen from above, in units."""
-    placed = box.placement
-    return (*box.middle, placed.w / unit, placed.d / unit, placed.yaw)
+def _margin(support: Support, unit_mm: float) -> float | None:
+    """Return a margin in millimetres; None if nothing carries."""
+    return None if np.isnan(support.margin) else float(to_mm(support.margin, unit_mm))
 
 
 def _whole(row: NDArray[np.int64]) -> NDArray[np.int64]:

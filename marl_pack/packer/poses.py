@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from marl_pack.checks import real_number, shown
 from marl_pack.plan_columns import MOST_YAW
 
-ROUNDING = 1e-6
+ROUNDING = 1e-9
 """Units by which a float may be wrong."""
+DECIMALS = 5
+"""Decimals of a reported pose, in millimetres and degrees."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Pose:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "yaw"):
-            object.__setattr__(self, name, real_number(getattr(self, name), f"pose: {name}"))
+            number = real_number(getattr(self, name), f"pose: {name}")
+            object.__setattr__(self, name, round(number, DECIMALS))
         if abs(self.yaw) > MOST_YAW:
             raise ValueError(
                 f"pose: yaw = {self.yaw:g}: needs degrees from -{MOST_YAW:g} to {MOST_YAW:g}"
@@ -80,6 +83,7 @@ def rectangles(
     inside = np.concatenate(
         (np.ceil(middle - inner - ROUNDING), np.floor(middle + inner + ROUNDING))
     )
+    inside[2:] = np.maximum(inside[2:], inside[:2])  # nothing carries if it is that thin
     return around.astype(np.int64), inside.astype(np.int64)
 
 

@@ -14,7 +14,7 @@ EVERY = np.ones(1, np.bool_)
 
 
 def why_not(bins: ExactBins, item: Goods) -> NoPlace:
-    """Return why an item, one row, has no place in the only bin; it must have none.
+    """Return why an item, one row, got no place in the only bin.
 
     The conditions are lifted one after another, until the item has a place.
     """
@@ -38,6 +38,8 @@ def why_not(bins: ExactBins, item: Goods) -> NoPlace:
                 f"the bin would weigh {total:g} kg, more than max_weight_kg = "
                 f"{spec.max_weight_kg:g}",
             )
+    if bins.any_move(item, EVERY)[0]:
+        return no("policy", "the policy chose no place, though there is one")
     lifted = bins.select([0])
     lifted.state.stackable[:] = True
     lifted.state.max_load[:] = np.inf
