@@ -187,7 +187,7 @@ def measure_trial(stream: str, processes: int) -> dict[str, Any]:
 
 
 def pack_with_errors(stream: str, episode: int) -> tuple[Plan, int, int]:
-    """Pack with an error at each placement, which the packer is told.
+    """Pack with an error at each placement, which is reported to the packer.
 
     Args:
         stream: the goods.
@@ -220,7 +220,7 @@ def pack_with_errors(stream: str, episode: int) -> tuple[Plan, int, int]:
 
 
 def measure_poses(stream: str, processes: int) -> dict[str, Any]:
-    """Measure packings whose true poses are told to the packer, and without errors."""
+    """Measure packings whose true poses are reported to the packer, and without errors."""
     done = [pack_with_errors(stream, episode) for episode in range(POSES)]
     plans = [plan for plan, _, _ in done]
     exact = [pack_exactly(stream, episode) for episode in range(POSES)]

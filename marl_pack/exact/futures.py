@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -68,21 +68,24 @@ class History:
     goods: Goods
     jump: float = 0.1
 
-    def __post_init__(self) -> None:
-        sides = self.goods.sides
-        _, kinds = np.unique(sides, axis=0, return_inverse=True)
-        rows = np.argsort(kinds, kind="stable")
-        bounds = np.searchsorted(kinds[rows], np.arange(kinds.max(initial=-1) + 2))
-        equal = [rows[a:b] for a, b in pairwise(bounds.tolist())]
-        object.__setattr__(self, "_kinds", kinds.ravel())
-        object.__setattr__(self, "_equal", equal)
+    @cached_property
+    def _kinds(self) -> NDArray[np.int64]:
+        """The kind of each box, int64 [R]: boxes of equal sides are of one kind."""
+        _, kinds = np.unique(self.goods.sides, axis=0, return_inverse=True)
+        return kinds.ravel()
+
+    @cached_property
+    def _equal(self) -> list[NDArray[np.int64]]:
+        """The rows of the boxes of each kind."""
+        rows = np.argsort(self._kinds, kind="stable")
+        counts = np.bincount(self._kinds)
+        return np.split(rows, counts.cumsum()[:-1])
 
     def draw(
         self, generator: np.random.Generator, visible: Goods, shown: Goods, length: int
     ) -> tuple[Goods, NDArray[np.int64]]:
         """Draw rows of the history."""
-        kinds: NDArray[np.int64] = self._kinds  # type: ignore[attr-defined]
-        equal: list[NDArray[np.int64]] = self._equal  # type: ignore[attr-defined]
+        kinds, equal = self._kinds, self._equal
         count = len(self.goods)
         points, jumps = generator.random(length), generator.random(length) < self.jump
         known = np.flatnonzero((self.goods.sides == visible.sides[0]).all(1))

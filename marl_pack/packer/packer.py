@@ -329,7 +329,7 @@ class Packer:
         self.calls.append(call)
 
     def _replay(self, done: list[Call]) -> None:
-        """Begin anew and do calls; if one is impossible, nothing changes."""
+        """Begin again and do calls; if one is impossible, nothing changes."""
         before = dict(vars(self))
         try:
             self._begin()

@@ -48,7 +48,7 @@ class SeededMoves:
     def __call__(self, turn: Turn) -> NDArray[np.int64]:
         """Return one of the legal moves, int64 [1]."""
         generator = np.random.default_rng((self.seed, turn.number))
-        moves: NDArray[np.int64] = RandomMoves(generator)(turn)  # type: ignore[arg-type]
+        moves: NDArray[np.int64] = RandomMoves(generator)(turn)  # type: ignore[arg-type]  # a Turn has all that it reads
         return moves
 
 
@@ -111,7 +111,7 @@ def _search(policy: Any, spec: ExactSpec, plan: Any, catalogue: Any, seed: int) 
         scored = make_exact_policy(policy)
         assert isinstance(scored, Scored)
         weights = scored.weights
-    return Search(weights, plan, futures, seed)  # type: ignore[return-value]
+    return Search(weights, plan, futures, seed)  # type: ignore[return-value]  # as above
 
 
 def _agents(policy: Any, spec: ExactSpec, grid_mm: float | None, seed: int) -> PackerPolicy:

@@ -34,7 +34,7 @@ class Turn:
 
     @property
     def episode(self) -> NDArray[np.int64]:
-        """0, int64 [1]."""
+        """Number of the episode: always 0, int64 [1]."""
         return np.zeros(1, np.int64)
 
     @cached_property
