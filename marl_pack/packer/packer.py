@@ -156,7 +156,7 @@ class Packer:
 
         Args:
             sides: the box's own sides w, d, h in millimetres.
-            order, **attributes: as for :meth:`place`.
+            order, attributes: as for :meth:`place`.
         """
         return self._offer(self._goods(sides, attributes), order).answer
 
@@ -189,7 +189,7 @@ class Packer:
         """Leave out a box that has no place, and record why; the plan lists it.
 
         Args:
-            sides, order, **attributes: the box, as for :meth:`place`.
+            sides, order, attributes: the box, as for :meth:`place`.
 
         Raises:
             ValueError: if the box has a place, or is impossible.
