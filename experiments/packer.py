@@ -8,8 +8,8 @@ in).
 Searches stop by the clock, so faster machines have higher figures.
 
 ``answers`` are the times of ``marl-pack pack -``; ``orders`` are packed onto pallets. ``poses`` are
-packings by ``linear`` in which each box is put down with an error, which is reported to the packer;
-a trial then builds them as they are (:mod:`marl_pack.sapien_check.trials`).
+packings by tuned ``linear`` in which each box is put down with an error, which is reported to the
+packer; a trial then builds them as they are (:mod:`marl_pack.sapien_check.trials`).
 """
 
 from __future__ import annotations
@@ -370,7 +370,7 @@ def keys() -> Iterator[str]:
 
 
 def measure(key: str, processes: int) -> dict[str, Any]:
-    """Measure one row."""
+    """Return the figures of the row with a key."""
     stream, kind, *rest = key.split()
     if stream == "answers":
         return measure_answers(kind)

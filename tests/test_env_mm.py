@@ -186,4 +186,4 @@ def test_a_wrong_argument_says_what_would_be_right(options: Any, message: str) -
 
 def test_an_unknown_world_is_refused() -> None:
     with pytest.raises(ValueError, match="world = 'inches': one of 'cells', 'mm'"):
-        env(world="inches")  # type: ignore[call-overload]
+        env(world="inches")  # type: ignore[call-overload]  # it must be refused
