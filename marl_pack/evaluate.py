@@ -31,8 +31,10 @@ from marl_pack.options import (
     MOST_AT_ONCE,
     ONLY_CELLS,
     ONLY_MM,
+    add_explain,
     add_mm_options,
     add_options,
+    check_explain,
     check_names,
 )
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "python -m marl_pack.evaluate"
 EPISODES = 1000  # default number of episodes of a generated stream
+MOST_EXPLAINED = 100  # largest number of episodes with --explain: their files are large
 
 
 def show(rows: dict[str, dict[str, Any]], title: str, console: Console) -> None:
@@ -134,7 +137,8 @@ def parser(program: str = PROGRAM) -> Parser:
     add_body_options(physics)
     add("--processes", type=int, default=1,
         help="number of processes that judge at once (default: 1)")  # fmt: skip
-    add = options.add_argument_group("output").add_argument
+    group = options.add_argument_group("output")
+    add = group.add_argument
     add("--json", type=Path, metavar="FILE", help="write the figures to this file")
     add(
         "--save-stacks",
@@ -142,6 +146,7 @@ def parser(program: str = PROGRAM) -> Parser:
         metavar="FILE",
         help="write the packed boxes of every episode to this file (.npz, .json or .csv)",
     )
+    add_explain(group, "--save-stacks")
     return options
 
 
@@ -153,6 +158,8 @@ def check_outputs(arguments: argparse.Namespace) -> None:
     """
     if arguments.save_stacks is not None:
         check_ending(arguments.save_stacks, "--save-stacks")
+    if arguments.explain:
+        check_explain(arguments.save_stacks, "--save-stacks")
     for path in (arguments.json, arguments.save_stacks):
         if path is not None:
             check_writable(path)
@@ -183,6 +190,10 @@ def check_options(
     if episodes < 1 or (available and episodes > available):
         most = f" … {available}, the sequences of the file" if available else " or more"
         raise ValueError(f"--episodes {episodes}: needs 1{most}")
+    if arguments.explain and episodes > MOST_EXPLAINED:
+        raise ValueError(
+            f"--explain: needs at most {MOST_EXPLAINED} episodes, not {episodes}; use --episodes"
+        )
     return episodes, bodies
 
 

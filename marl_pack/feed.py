@@ -50,6 +50,7 @@ class Feed:
             "catalogue": None if chosen.catalogue is None else str(chosen.catalogue),
             "grid_mm": chosen.grid_mm, "seed": chosen.seed,
             "bins": chosen.bins, "open_next": chosen.no_place == NEXT_BIN,
+            "explain": chosen.explain,
         }  # fmt: skip
         if chosen.present is not None:
             if not chosen.present.is_file():

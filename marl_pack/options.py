@@ -78,6 +78,30 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add("--threads", type=int, default=1, help="threads on the CPU (default: 1)")
 
 
+def add_explain(group: argparse._ArgumentGroup, file: str) -> None:
+    """Add ``--explain`` to a command that writes plans.
+
+    Args:
+        group: the group of options.
+        file: the option that names the file of plans.
+    """
+    group.add_argument(
+        "--explain", action="store_true",
+        help=f"write into the .json file of {file} why each box is where it is: the legal "
+             "placements, probabilities and values (docs/replay.md)",
+    )  # fmt: skip
+
+
+def check_explain(path: Path | None, option: str) -> None:
+    """Refuse ``--explain`` without a JSON file of plans.
+
+    Raises:
+        ValueError: naming the option that names the file.
+    """
+    if path is None or path.suffix.lower() != ".json":
+        raise ValueError(f"--explain: needs {option} with a .json file")
+
+
 def add_mm_options(options: argparse.ArgumentParser) -> None:
     """Add ``--world`` and the options of games in millimetres to a command."""
     group = options.add_argument_group("game in millimetres (--world mm)")

@@ -17,7 +17,7 @@ from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.files import check_writable
 from marl_pack.option_record import add_arguments
-from marl_pack.options import MM_POLICIES, NEXT_BIN, NO_PLACE
+from marl_pack.options import MM_POLICIES, NEXT_BIN, NO_PLACE, add_explain, check_explain
 from marl_pack.plan_archive import check_ending
 from marl_pack.terminal import Parser, announce_compiling, make_console
 
@@ -78,7 +78,8 @@ def parser(program: str = PROGRAM) -> Parser:
     add_arguments(
         options.add_argument_group("game in millimetres"), ExactSpec, leave_out=("alpha", "beta")
     )
-    add = options.add_argument_group("output").add_argument
+    group = options.add_argument_group("output")
+    add = group.add_argument
     add(
         "--out",
         type=Path,
@@ -88,6 +89,7 @@ def parser(program: str = PROGRAM) -> Parser:
     add("--picture", type=Path, metavar="FILE",
         help="draw the packed bin (.png), or how it was packed (.gif); with several bins, one file "
              "each, FILE-0, FILE-1, …")  # fmt: skip
+    add_explain(group, "--out")
     add("--state", type=Path, metavar="FILE",
         help="with -: save the packer to this .json file before each answer; if the file exists, "
              "go on from there")  # fmt: skip
@@ -107,6 +109,8 @@ def run(chosen: argparse.Namespace) -> int:
         raise ValueError("--state: only with -, for a conveyor")
     if chosen.out is not None:
         check_ending(chosen.out, "--out")
+    if chosen.explain:
+        check_explain(chosen.out, "--out")
     if chosen.picture is not None and chosen.picture.suffix.lower() not in PICTURES:
         raise ValueError(f"--picture {chosen.picture}: needs the ending .png or .gif")
     for path in (chosen.out, chosen.state, chosen.picture):

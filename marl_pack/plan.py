@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.checks import decimals, exact, number_in, real_number, whole_number
+from marl_pack.explanation import Explanation
 from marl_pack.files import write_csv, write_json
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.inputs import read_json, read_lines
@@ -38,7 +39,7 @@ VERSION = 2
 """Version of a plan in JSON. Version 1 had no ``version`` and only the keys :data:`BOX`."""
 KEYS = (UNIT, "bins", "boxes")
 """Keys that every plan has in JSON."""
-OPTIONAL = ("version", "orders", "left_out")
+OPTIONAL = ("version", "orders", "left_out", "explanations")
 """Keys that a plan may have."""
 LEFT_OUT = ("id", "w", "d", "h", "reason")
 """Keys of a box without a place."""
@@ -82,6 +83,8 @@ class Plan:
     margins: NDArray[np.float64] = None  # type: ignore[assignment]  # [n] NaN: unknown
     left_out: tuple[LeftOut, ...] = ()  # boxes that had no place
     orders: tuple[str, ...] = ()  # [B]  order of each bin; () if there are no orders
+    # [n]  why each box is where it is, None where unknown; () if there are none
+    explanations: tuple[Explanation | None, ...] = ()
 
     def __post_init__(self) -> None:
         n, b = len(self.positions), len(self.bin_sizes)
@@ -107,9 +110,10 @@ class Plan:
             values = extra.array(getattr(self, extra.field), n)
             values.flags.writeable = False
             object.__setattr__(self, extra.field, values)
-        object.__setattr__(self, "ids", tuple(self.ids))
-        object.__setattr__(self, "left_out", tuple(self.left_out))
-        object.__setattr__(self, "orders", tuple(self.orders))
+        for key in ("ids", "left_out", "orders", "explanations"):
+            object.__setattr__(self, key, tuple(getattr(self, key)))
+        if len(self.explanations) not in (0, n):
+            raise ValueError(f"explanations: needs one for each of {n} boxes, or none")
         if self.orders and (
             len(self.orders) != b or not all(isinstance(name, str) for name in self.orders)
         ):
@@ -243,6 +247,8 @@ class Plan:
         plain = ("ids", "unit_mm", "left_out", "orders")
         if any(getattr(self, name) != getattr(other, name) for name in plain):
             return False
+        if self._reasons() != other._reasons():
+            return False
         arrays = [f.name for f in fields(Plan) if isinstance(getattr(self, f.name), np.ndarray)]
         return all(
             np.array_equal(mine, theirs, equal_nan=mine.dtype.kind == "f")
@@ -322,6 +328,9 @@ class Plan:
             self.orientations[which], self.weights[which], self.centres[which],
             tuple(name for name, chosen in zip(self.ids, which, strict=True) if chosen),
             self.unit_mm, orders=tuple(orders),
+            explanations=tuple(
+                why for why, chosen in zip(self.explanations, which, strict=False) if chosen
+            ),
             **{e.field: getattr(self, e.field)[which] for e in EXTRAS},
         )  # fmt: skip
 
@@ -354,7 +363,8 @@ class Plan:
         """Return the plan as a dict for JSON; ``plan.schema.json`` describes it.
 
         Its keys are ``version``, ``unit_mm``, ``bins`` (rows W, D, H), ``boxes`` and, if there are
-        any, ``orders`` and ``left_out``. Each box is a dict with the keys :data:`BOX`, and those of
+        any, ``orders``, ``left_out`` and ``explanations`` (:class:`Explanation`, or None for a box
+        without one). Each box is a dict with the keys :data:`BOX`, and those of
         :data:`marl_pack.plan_columns.EXTRAS` where its value is not the default.
         """
         boxes = [dict(zip(BOX, row, strict=True)) for row in self._rows()]
@@ -371,6 +381,8 @@ class Plan:
                 dict(zip(LEFT_OUT, (box.id, *box.sides, box.reason), strict=True))
                 for box in self.left_out
             ]
+        if any(self.explanations):
+            content["explanations"] = self._reasons()
         return content
 
     @classmethod
@@ -413,6 +425,7 @@ class Plan:
             others["orders"] = content.get("orders", [])
             if not isinstance(others["orders"], list):
                 raise ValueError("orders: needs a list of texts")
+            others["explanations"] = _explanations(content.get("explanations", []))
             if content[UNIT] is not None:
                 real_number(content[UNIT], UNIT)
         except ValueError as error:
@@ -421,6 +434,12 @@ class Plan:
             return cls._of_rows(sizes, rows, content[UNIT], **others)
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from None
+
+    def _reasons(self) -> list[dict[str, Any] | None]:
+        """Return the explanations for JSON; an empty list if there are none."""
+        if not any(self.explanations):
+            return []
+        return [None if why is None else why.to_dict() for why in self.explanations]
 
     def to_json(self, path: str | Path) -> None:
         """Write the plan as JSON (:meth:`to_dict`)."""
@@ -500,7 +519,7 @@ class Plan:
     def to_csv(self, path: str | Path) -> None:
         """Write the plan as CSV: the names of the columns, then :meth:`to_lines`.
 
-        CSV files do not have the boxes that had no place.
+        CSV files have neither the boxes that had no place nor explanations.
         """
         extras = self.has_extras
         columns = ALL_COLUMNS if extras else COLUMNS
@@ -556,6 +575,20 @@ def _left_out(rows: Any) -> tuple[LeftOut, ...]:
             raise ValueError(f"left_out: box {k}: id and reason need texts")
         boxes.append(LeftOut(row["id"], (sides[0], sides[1], sides[2]), row["reason"]))
     return tuple(boxes)
+
+
+def _explanations(rows: Any) -> list[Explanation | None]:
+    """Return the explanations in JSON; null where a box has none.
+
+    Raises:
+        ValueError: naming the explanation and what it needs.
+    """
+    if not isinstance(rows, list):
+        raise ValueError("explanations: needs a list")
+    return [
+        None if row is None else Explanation.of_dict(row, f"explanation {k}")
+        for k, row in enumerate(rows)
+    ]
 
 
 def _volume(sides: Array) -> float:

@@ -18,7 +18,7 @@ from rich.table import Table
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.options import GAME_NOTE, add_options, check_names
+from marl_pack.options import GAME_NOTE, add_explain, add_options, check_explain, check_names
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import check_ending, save_plan
 from marl_pack.terminal import Parser, make_console, make_status
@@ -40,12 +40,14 @@ def parser(program: str = PROGRAM) -> Parser:
     options.add_argument_group("episode").add_argument(
         "--episode", type=int, default=0, help="number of the sequence (default: 0)"
     )
-    add = options.add_argument_group("output").add_argument
+    group = options.add_argument_group("output")
+    add = group.add_argument
     add("--picture", type=Path, default=Path("play.png"),
         help="file for a picture of the packed bin (.png), or an animation of how it was packed "
              "(.gif) (default: play.png)")  # fmt: skip
     add("--save", type=Path, metavar="FILE",
         help="write the packed boxes to this file (.json, .csv or .npz)")  # fmt: skip
+    add_explain(group, "--save")
     return options
 
 
@@ -61,9 +63,13 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     if chosen.save is not None:
         check_ending(chosen.save, "--save")
         check_writable(chosen.save)
+    if chosen.explain:
+        check_explain(chosen.save, "--save")
     check_names(chosen)
     with make_status(console, "loading the player"):
-        from marl_pack.players import choose, set_threads  # slow to import
+        from marl_pack.agents.explaining import explain  # slow to import
+        from marl_pack.evaluation.rollout import Reasons
+        from marl_pack.players import choose, set_threads
 
         set_threads(chosen.threads)
         setup = choose(chosen, console)
@@ -79,12 +85,15 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     table = Table()
     for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
         table.add_column(column, justify="right")
+    reasons = Reasons(1)
     with make_status(console, "playing") as status:
         while bool(game.alive):
             item, count = game.items.sides[0].tolist(), int(game.bins.count)
             status.update(f"playing: item {count + 1}")
             orientation, cell = policy(game)
+            explained = explain(policy, game, (orientation, cell)) if chosen.explain else None
             outcome = game.place(orientation, cell)
+            reasons.add(explained, outcome.placed.tolist())
             # Without a mask of orientations the choice may have no legal cell; this ends the game.
             placed = int(outcome.placed) > count
             axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
@@ -104,7 +113,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     from marl_pack.render.animation import save_gif
     from marl_pack.render.picture import draw
 
-    plan = Plan.from_bins(game.bins.to("cpu"), 0)
+    (plan,) = reasons.of([Plan.from_bins(game.bins.to("cpu"), 0)])
     balance = "in strict equilibrium" if strict_equilibrium(plan) else "NOT in equilibrium"
     ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)

@@ -56,7 +56,7 @@ class Setup:
         self, policy: Policy, episodes: int, progress: Callable[[int], object]
     ) -> Iterator[Rollout]:
         """Play episodes in batches (:func:`marl_pack.evaluation.rollout.batches`)."""
-        return batches(policy, self.game, episodes, progress)
+        return batches(policy, self.game, episodes, progress, self.arguments.explain)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class SetupMm:
         self, policy: ExactPolicy, episodes: int, progress: Callable[[int], object]
     ) -> Iterator[Rollout]:
         """Play episodes in batches (:func:`marl_pack.evaluation.rollout.batches_mm`)."""
-        return batches_mm(policy, self.game, episodes, progress)
+        return batches_mm(policy, self.game, episodes, progress, self.arguments.explain)
 
     def game(self, n: int, first_episode: int) -> ExactPacking:
         """Return ``n`` games without ``auto_reset``; the first plays episode ``first_episode``."""

@@ -13,7 +13,7 @@ LAYERS = (
      "renamed",
      "terminal"),
     ("geometry",),
-    ("bins", "items", "plan", "plan_archive", "plan_columns", "render"),
+    ("bins", "explanation", "items", "plan", "plan_archive", "plan_columns", "render"),
     ("stability", "sapien_check"),
     ("exact",),
     ("game",),

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from marl_pack import renamed
 from marl_pack.agents.afterstates.lookahead import Lookahead
@@ -21,6 +22,7 @@ from marl_pack.agents.policy import (
     Placement,
     PlacementAgent,
     Policy,
+    Reasons,
     draw,
     draw_placement,
 )
@@ -49,10 +51,23 @@ class Heuristic:
             legal: the moves to choose among; all legal moves by default.
             lookahead: computes the afterstates; a new one by default.
         """
+        return (legal or game.moves).least(self._rank(game, lookahead))
+
+    def _rank(self, game: Packing, lookahead: Lookahead | None = None) -> Tensor:
+        """Compute the keys as one number, int64 [G, 6, W, D]; the lowest is the best."""
         rank = torch.zeros_like(game.mask, dtype=torch.int64)
         for value, bound in self.keys(Candidates(game, lookahead or Lookahead())):
             rank = rank * bound + value
-        return (legal or game.moves).least(rank)
+        return rank
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return the order of the placements (:class:`marl_pack.agents.policy.Explained`)."""
+        rank = self._rank(game)
+        values = torch.full(rank.shape, torch.nan, dtype=torch.float64, device=rank.device)
+        for g in range(game.n):
+            legal = game.mask[g]
+            values[g][legal] = -torch.unique(rank[g][legal], return_inverse=True)[1].double()
+        return Reasons(values=values, value_of="rank, 0 is the best")
 
 
 @dataclass(frozen=True)

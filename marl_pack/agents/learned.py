@@ -11,9 +11,13 @@ from marl_pack.agents.networks.distribution import check_outputs
 from marl_pack.agents.networks.kinds import observe
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.agents.networks.symmetry import mean_probabilities
-from marl_pack.agents.policy import Placement
+from marl_pack.agents.policy import AFTERSTATE_VALUE, Placement, Reasons
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
+from marl_pack.geometry import ORIENTATIONS
+
+TINY = 1e-300
+"""Stands for the probability 0, by which nothing can be divided."""
 
 
 class LearnedAgent:
@@ -45,6 +49,16 @@ class LearnedAgent:
             probabilities = self.actor.log_probs(observation).double().exp()
         check_outputs(probabilities)
         return probabilities
+
+    def chances(self, game: Packing, *orientation: Tensor) -> Tensor:
+        """Compute the probabilities of all actions in each game, float64 [G, K]."""
+        return self.probabilities(self.observe(game, *orientation))
+
+    def values(self, game: Packing) -> Tensor | None:
+        """Return the values of afterstates, float32 [G, 6, W, D]; None if there is no critic."""
+        if self.lookahead.critic is None:
+            return None
+        return self.lookahead.afterstate_value(game)
 
     def best(self, observation: Observation) -> Tensor:
         """Return the most probable action, int64 [G], from one evaluation of the network.
@@ -89,5 +103,13 @@ class JointPolicy:
         """
         if moves is None:
             return game.floor.split(self.agent(game))
-        probabilities = self.agent.probabilities(self.agent.observe(game))
-        return moves.least(-probabilities.view_as(moves.mask))
+        return moves.least(-self.agent.chances(game).view_as(moves.mask))
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return what the agent computed (:class:`marl_pack.agents.policy.Explained`)."""
+        joint = self.agent.chances(game).view(game.n, len(ORIENTATIONS), -1)
+        first = joint.sum(2)
+        row = torch.arange(game.n, device=joint.device)
+        second = joint[row, orientation] / first[row, orientation].clamp(min=TINY)[:, None]
+        values = self.agent.values(game)
+        return Reasons(first, second, values, "" if values is None else AFTERSTATE_VALUE)

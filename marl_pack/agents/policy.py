@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -30,6 +30,28 @@ PlacementAgent = Callable[[Packing, Tensor], Tensor]
 """``(game, orientation int64 [G]) -> cell int64 [G]``: the choice of the placement agent."""
 
 
+AFTERSTATE_VALUE = "afterstate value"
+"""Name of the values that learned agents observe: reward (Eq. 5) plus the return still to come."""
+
+
+@dataclass(frozen=True)
+class Reasons:
+    """What a policy computed for the legal placements of G games; None where it did not."""
+
+    orientation_probabilities: Tensor | None = None  # [G, 6]
+    probabilities: Tensor | None = None  # [G, W · D]  of the cells in the chosen orientation
+    values: Tensor | None = None  # [G, 6, W, D]  the highest is the best; NaN: not computed
+    value_of: str = ""  # what the values are
+
+
+@runtime_checkable
+class Explained(Protocol):
+    """A policy that says what it computed."""
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return what it computed, given the chosen orientations, int64 [G]."""
+
+
 @dataclass(frozen=True)
 class InTurns:
     """A policy of two agents: first the orientation agent acts, then the placement agent.
@@ -45,6 +67,20 @@ class InTurns:
         """Return orientation and cell of each game, int64 [G] each."""
         orientation = self.orientation_agent(game)
         return orientation, self.placement_agent(game, orientation)
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return what learned agents computed (:class:`Explained`)."""
+        first, second = self.orientation_agent, self.placement_agent
+        values = None
+        for agent in (first, second):
+            if values is None and hasattr(agent, "values"):
+                values = agent.values(game)
+        return Reasons(
+            first.chances(game) if hasattr(first, "chances") else None,
+            second.chances(game, orientation) if hasattr(second, "chances") else None,
+            values,
+            "" if values is None else AFTERSTATE_VALUE,
+        )
 
 
 def draw(

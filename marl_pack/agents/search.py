@@ -19,7 +19,7 @@ from torch import Tensor
 
 from marl_pack.agents.learned import LearnedAgent
 from marl_pack.agents.networks.actor_critic import Critic
-from marl_pack.agents.policy import Placement
+from marl_pack.agents.policy import Placement, Reasons
 from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
@@ -59,6 +59,8 @@ class Planner:
         self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
         self.critic, self.settings, self.futures = critic, settings, futures
         self.seed = -1 - seed  # real games have seeds ≥ 0: the futures differ from them
+        # Of each round of the last call: games, their pairs, which are legal, and their means.
+        self._tried: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
 
     @torch.inference_mode()
     def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
@@ -71,6 +73,7 @@ class Planner:
             game: the games.
             moves: the legal pairs to choose among; all legal pairs by default.
         """
+        self._tried = []
         best = torch.zeros(game.n, dtype=torch.int64, device=game.device)
         index = game.alive.nonzero().squeeze(1)  # [B]
         pairs, legal = self._propose(game, index, moves or game.moves)  # [B, M]
@@ -86,11 +89,28 @@ class Planner:
             k = max(1, budget // (rounds * pairs.shape[1]))
             total[legal] += self._sum(game, index, pairs, legal, played, k)
             played += k
+            self._tried.append((index, pairs, legal, total / played))
             remaining = 1 if rounds_left == 1 else -(-pairs.shape[1] // 2)
             better = total.masked_fill(~legal, -torch.inf).topk(remaining, 1).indices
             pairs, legal, total = (x.gather(1, better) for x in (pairs, legal, total))
         best[index] = pairs[:, 0]
         return game.floor.split(best)
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return what the agents, and the last call, computed.
+
+        The values are the mean results of the pairs that the last call tried
+        (:class:`marl_pack.agents.policy.Explained`).
+        """
+        values = torch.full(game.mask.shape, torch.nan, dtype=torch.float64, device=game.device)
+        for index, pairs, legal, means in self._tried:
+            row, rank = legal.nonzero().unbind(1)
+            values.view(game.n, -1)[index[row], pairs[row, rank]] = means[row, rank]
+        return Reasons(
+            self.orientation_agent.chances(game),
+            self.placement_agent.chances(game, orientation),
+            values, "mean result of imagined games",
+        )  # fmt: skip
 
     def _sum(
         self, game: Packing, index: Tensor, pairs: Tensor, legal: Tensor, first: int, k: int

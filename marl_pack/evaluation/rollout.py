@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.checks import whole_number
+from marl_pack.exact.explaining import explain as explain_mm
+from marl_pack.explanation import Explanation
 from marl_pack.plan import Plan
 
 if TYPE_CHECKING:
@@ -42,6 +44,40 @@ class Rollout:
         return np.array([len(plan) for plan in self.plans], np.int64)
 
 
+class Reasons:
+    """Collects why each box of many games is where it is.
+
+    Args:
+        games: number of games, G.
+    """
+
+    def __init__(self, games: int) -> None:
+        self._games: list[list[Explanation | None]] = [[] for _ in range(games)]
+
+    def add(self, explanations: Sequence[Explanation | None] | None, counts: Sequence[int]) -> None:
+        """Keep the explanations of the boxes that have just been placed.
+
+        Args:
+            explanations: one for each game, None for games that have ended; or None for nothing.
+            counts: number of boxes in each game after the placement.
+        """
+        for own, explanation, count in zip(
+            self._games, explanations or (), counts if explanations else (), strict=True
+        ):
+            if explanation is not None and count > len(own):
+                own += [None] * (count - 1 - len(own))  # boxes that were there at the beginning
+                own.append(explanation)
+
+    def of(self, plans: list[Plan]) -> list[Plan]:
+        """Return the plans of the games, with their explanations."""
+        if not any(self._games):
+            return plans
+        return [
+            replace(plan, explanations=(*own, *[None] * (len(plan) - len(own))))
+            for plan, own in zip(plans, self._games, strict=True)
+        ]
+
+
 def play(
     policy: Policy,
     game: Callable[[int, int], Packing],
@@ -61,6 +97,7 @@ def batches(
     game: Callable[[int, int], Packing],
     episodes: int,
     progress: Callable[[int], object] = lambda done: None,
+    explained: bool = False,
 ) -> Iterator[Rollout]:
     """Play episodes 0 … episodes - 1 in batches, and yield each batch when it has ended.
 
@@ -69,10 +106,13 @@ def batches(
         game: (n, first_episode) → n games without ``auto_reset``.
         episodes: number of episodes, E.
         progress: called with the number of episodes that have just ended.
+        explained: whether the plans say why each box is where it is; the time to find out counts.
 
     Raises:
         ValueError: unless ``episodes`` is a whole number ≥ 1.
     """
+    from marl_pack.agents.explaining import explain  # slow to import
+
     episodes = whole_number(episodes, "episodes", 1)
     width, depth, _ = game(1, 0).size
     batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))
@@ -80,10 +120,14 @@ def batches(
         games = game(min(batch, episodes - first), first)
         progress(int((~games.alive).sum()))
         start = time.perf_counter()
+        reasons = Reasons(games.n)
         while bool(games.alive.any()):
-            outcome = games.place(*policy(games))
+            choice = policy(games)
+            explanations = explain(policy, games, choice) if explained else None
+            outcome = games.place(*choice)
+            reasons.add(explanations, outcome.placed.tolist())
             progress(int(outcome.done.sum()))
-        yield Rollout(games.plans(), time.perf_counter() - start)
+        yield Rollout(reasons.of(games.plans()), time.perf_counter() - start)
 
 
 def batches_mm(
@@ -91,6 +135,7 @@ def batches_mm(
     game: Callable[[int, int], ExactPacking],
     episodes: int,
     progress: Callable[[int], object] = lambda done: None,
+    explained: bool = False,
 ) -> Iterator[Rollout]:
     """Play episodes in millimetres in batches, like :func:`batches`.
 
@@ -99,6 +144,7 @@ def batches_mm(
         game: (n, first_episode) → n games without ``auto_reset``.
         episodes: number of episodes, E.
         progress: called with the number of episodes that have just ended.
+        explained: as for :func:`batches`.
 
     Raises:
         ValueError: unless ``episodes`` is a whole number ≥ 1.
@@ -108,7 +154,17 @@ def batches_mm(
         games = game(min(BATCH_MM, episodes - first), first)
         progress(int((~games.alive).sum()))
         start = time.perf_counter()
+        reasons = Reasons(games.n)
         while games.alive.any():
-            outcome = games.place(policy(games))
+            moves = policy(games)
+            explanations = None
+            if explained:
+                explanations = [
+                    explain_mm(policy, games, g, int(moves[g])) if alive else None
+                    for g, alive in enumerate(games.alive.tolist())
+                ]
+            outcome = games.place(moves)
+            reasons.add(explanations, outcome.packed.tolist())
             progress(int(outcome.done.sum()))
-        yield Rollout([games.plan(g) for g in range(games.n)], time.perf_counter() - start)
+        plans = reasons.of([games.plan(g) for g in range(games.n)])
+        yield Rollout(plans, time.perf_counter() - start)

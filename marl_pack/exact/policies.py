@@ -18,6 +18,7 @@ from marl_pack import renamed
 from marl_pack.checks import LARGEST_SEED, real_number, shown, whole_number
 from marl_pack.exact.bins import NOWHERE
 from marl_pack.exact.choice import BEST_FIT, DBLF, HEIGHT_MIN, LINEAR
+from marl_pack.exact.explaining import Reasons
 from marl_pack.exact.features import FEATURES
 from marl_pack.inputs import read_json
 from marl_pack.items.names import check_names
@@ -53,6 +54,12 @@ class Scored:
     def __call__(self, game: ExactPacking) -> NDArray[np.int64]:
         """Return the best move of each game, int64 [G]."""
         return game.bins.best(game.items, self.kind, self.weights, game.alive)
+
+    def reasons(self, game: Any, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
+        """Return the linear score of each move (:class:`marl_pack.exact.explaining.Explained`)."""
+        if self.kind != LINEAR:
+            return Reasons()
+        return Reasons(game.bins.features(g, game.items.sides[g], moves) @ self.weights, "score")
 
 
 @dataclass(frozen=True)

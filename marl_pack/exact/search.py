@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from marl_pack.exact.bins import FIRST_ROOM, NOWHERE, ExactBins
 from marl_pack.exact.choice import LINEAR, best_move
+from marl_pack.exact.explaining import Reasons
 from marl_pack.exact.futures import Futures, Shown
 from marl_pack.exact.goods import Goods
 from marl_pack.exact.limits import CARRIES, ROW, Limits
@@ -140,16 +141,32 @@ class Search:
 
     def __post_init__(self) -> None:
         self.played = 0  # futures played so far
+        # Of the last call: the moves tried in each game, and their mean results.
+        self._tried: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
 
     def __call__(self, game: ExactPacking) -> NDArray[np.int64]:
         """Return the move of each game, int64 [G]; NOWHERE where the box has no place."""
         moves = np.full(len(game.bins), NOWHERE)
+        self._tried = {}
         for g in np.flatnonzero(game.alive).tolist():
             begin = self.clock()
             shown = game.shown(g)
             generator = np.random.default_rng((self.seed, int(game.episode[g]), len(shown)))
-            moves[g] = self._choose(game.bins.select([g]), game.items[[g]], shown, generator, begin)
+            bins, item = game.bins.select([g]), game.items[[g]]
+            moves[g], tried, means = self._choose(bins, item, shown, generator, begin)
+            self._tried[g] = tried, means
         return moves
+
+    def reasons(self, game: Any, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
+        """Return the mean results of the moves that the last call tried in game ``g``.
+
+        They are filled shares of the bin (:class:`marl_pack.exact.explaining.Explained`).
+        """
+        tried, means = self._tried[g]
+        filled = game.bins.utilization[g] + float(game.items.volumes[g]) / game.bins.volume
+        values = np.full(len(moves), np.nan)
+        values[np.searchsorted(moves, tried)] = filled + means / game.bins.volume
+        return Reasons(values, "mean filled share in futures")
 
     def ranked(self, bins: ExactBins, item: Goods) -> NDArray[np.int64]:
         """Return the best moves of an item in the only bin by the linear score, the best first."""
@@ -160,14 +177,12 @@ class Search:
     def _choose(
         self, bins: ExactBins, item: Goods, shown: Goods, generator: np.random.Generator,
         begin: int,
-    ) -> int:  # fmt: skip
-        """Return the best move of an item in the only bin."""
+    ) -> tuple[int, NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
+        """Return the best move of an item in the only bin, the moves tried and their means."""
         moves = self.ranked(bins, item)
-        if len(moves) < 2:
-            return int(moves[0]) if len(moves) else NOWHERE
         room = bins.spec.max_boxes - int(bins.state.count[0]) - 1
-        if not room:
-            return int(moves[0])
+        if len(moves) < 2 or not room:
+            return int(moves[0]) if len(moves) else NOWHERE, moves, np.full(len(moves), np.nan)
         trial = _Trial(self.weights, bins, item, moves)
         end = begin + int(self.settings.budget_ms * MILLISECOND)
 
@@ -207,7 +222,9 @@ class Search:
             means = values[:, survivors].mean(0) if len(values) else np.zeros(len(survivors))
             order = np.argsort(-means, kind="stable")
             survivors = np.sort(survivors[order[: -(-len(survivors) // 2)]])
-        return int(moves[self._better(int(survivors[0]), values)])
+        counts = np.isfinite(values).sum(0)
+        means = np.where(counts, np.nansum(values, 0) / np.maximum(counts, 1), np.nan)
+        return int(moves[self._better(int(survivors[0]), values)]), moves, means
 
     @staticmethod
     def _better(m: int, values: NDArray[np.float64]) -> int:

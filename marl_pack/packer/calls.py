@@ -22,6 +22,7 @@ from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.moves import encode
 from marl_pack.exact.present import Present
 from marl_pack.exact.spec import ExactSpec
+from marl_pack.explanation import Explanation
 from marl_pack.items.names import check_names
 from marl_pack.packer.answers import REASONS
 from marl_pack.packer.poses import Pose
@@ -43,6 +44,7 @@ class Placed:
     bin: int
     move: int
     order: str = ""
+    explanation: Explanation | None = None
 
 
 @dataclass(frozen=True)
@@ -123,10 +125,12 @@ def to_row(call: Call) -> dict[str, Any]:
     """Return a call for JSON."""
     if isinstance(call, Placed):
         orientation, x, y, z = placements(call.move).tolist()
-        return {
+        why = call.explanation
+        row = {
             "call": "place", "box": _box(call.item), "bin": call.bin, "orientation": orientation,
             "units": [x, y, z], "order": call.order,
         }  # fmt: skip
+        return row if why is None else {**row, "explanation": why.to_dict()}
     if isinstance(call, Reported):
         return {"call": "actual", "pose": [call.pose.x, call.pose.y, call.pose.yaw]}
     if isinstance(call, Skipped):
@@ -147,7 +151,8 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
     if not isinstance(row, dict) or row.get("call") not in list(keys):
         raise ValueError(f"call {shown(row)}: needs an object whose call is one of {[*keys]}")
     needed = ("call", *keys[row["call"]])
-    check_names(row, needed, needed, f"call {row['call']}", "key")
+    allowed = (*needed, "explanation") if row["call"] == "place" else needed
+    check_names(row, allowed, needed, f"call {row['call']}", "key")
     if row["call"] == "place":
         if not isinstance(row["units"], list) or len(row["units"]) != 3:
             raise ValueError(f"call place: units {shown(row['units'])}: needs x, y, z")
@@ -156,8 +161,10 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
         bin = whole_number(row["bin"], "call place: bin", 0)
         if not isinstance(row["order"], str):
             raise ValueError(f"call place: order {shown(row['order'])}: needs a text")
-        item = _goods(row["box"], spec)
-        return Placed(item, bin, int(encode(orientation, x, y, z)), row["order"])
+        item, why = _goods(row["box"], spec), row.get("explanation")
+        explanation = None if why is None else Explanation.of_dict(why, "call place: explanation")
+        move = int(encode(orientation, x, y, z))
+        return Placed(item, bin, move, row["order"], explanation)
     if row["call"] == "actual":
         return Reported(Pose.of(row["pose"]))
     if row["call"] == "skip":
@@ -219,7 +226,7 @@ def read(content: Any) -> tuple[dict[str, Any], list[Any]]:
     ):  # fmt: skip
         if not isinstance(content[key], kind):
             raise ValueError(f"{key}: needs {'a list' if kind is list else 'an object'}")
-    names = ("policy", "bins", "open_next", "plan", "catalogue", "grid_mm", "seed")
+    names = ("policy", "bins", "open_next", "plan", "catalogue", "grid_mm", "seed", "explain")
     check_names(content["arguments"], names, (), "arguments", "key")
     made = {"spec": ExactSpec.of(content["options"]), **content["arguments"]}
     if content["present"]:

@@ -7,7 +7,6 @@ there. So the grid limits what the agents see, and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,11 @@ from numpy.typing import NDArray
 
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.loading import Loader, trained_game
+from marl_pack.agents.policy import Explained
 from marl_pack.checks import real_number
 from marl_pack.exact.bins import NOWHERE, ExactBins, placements
 from marl_pack.exact.choice import LINEAR, best_of
+from marl_pack.exact.explaining import Reasons
 from marl_pack.exact.goods import AXES
 from marl_pack.exact.lengths import in_units
 from marl_pack.exact.policies import HEURISTICS
@@ -103,7 +104,7 @@ class CellAgent:
         self, source: str | Path, spec: ExactSpec, grid_mm: float | None = None, seed: int = 0
     ) -> None:
         checkpoint = checkpoints.read(source)
-        self.policy: Callable[[Packing], Any] = Loader(seed=seed).policy_of(checkpoint)
+        self.policy: Any = Loader(seed=seed).policy_of(checkpoint)
         game = trained_game(checkpoint)
         default = max(spec.bin_mm[:2]) / FLOOR_CELLS
         self.grid_mm = default if grid_mm is None else real_number(grid_mm, "grid_mm")
@@ -122,6 +123,7 @@ class CellAgent:
             1, (size[0], size[1], size[2]), "rs", sides=(shortest, min(sides[1], *size)),
             auto_reset=False, rule="hull_alpha",
         )  # fmt: skip
+        self._cells = np.empty(0, np.int64)  # [M]  of each legal move in the last call
         self._contact = HEURISTICS["max_contact"]().weights
 
     def __call__(self, turn: Turn) -> NDArray[np.int64]:
@@ -139,6 +141,29 @@ class CellAgent:
             )
         ])  # fmt: skip
 
+    def reasons(self, turn: Turn, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
+        """Return what the agents computed in the last call.
+
+        Moves that the grid shows at the same cell have the same probability and value
+        (:class:`marl_pack.exact.explaining.Explained`).
+        """
+        cells, orientations = self._cells, placements(moves)[:, 0]
+        if not (cells >= 0).any() or not isinstance(self.policy, Explained):
+            return Reasons()
+        orientation = placements(move)[0]
+        with torch.inference_mode():
+            own = self.policy.reasons(self.game, torch.tensor([int(orientation)]))
+        probabilities = values = first = None
+        if own.orientation_probabilities is not None:
+            first = own.orientation_probabilities[0].double().numpy()
+        if own.probabilities is not None:
+            known = (cells >= 0) & (orientations == orientation)
+            probabilities = np.where(known, own.probabilities[0].double().numpy()[cells], np.nan)
+        if own.values is not None:
+            of_cells = own.values[0].double().flatten(1).numpy()
+            values = np.where(cells >= 0, of_cells[orientations, cells], np.nan)
+        return Reasons(values, own.value_of, first, probabilities)
+
     def _choose(self, turn: Turn, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Show the agents the turn on the grid, and return the moves at the cell they choose.
 
@@ -148,7 +173,7 @@ class CellAgent:
         game = self.game
         where = placements(numbers)
         sides = self._show(turn.bins, turn.items.sides[0], np.unique(where[:, 0]))
-        cells = self._cells_of(where, sides)
+        cells = self._cells = self._cells_of(where, sides)
         shown = cells >= 0
         if not shown.any():
             return numbers

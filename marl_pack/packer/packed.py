@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.exact.goods import Goods
+from marl_pack.explanation import Explanation
 from marl_pack.packer.answers import Placement
 from marl_pack.packer.poses import Pose, overlap, rectangles
 
@@ -25,6 +26,7 @@ class Packed:
     planned: Placement  # before a pose was reported
     row: NDArray[np.int64]  # [10]  its row in the bin's state
     middle: tuple[float, float]  # x, y in units
+    explanation: Explanation | None = None
 
     def shape(self, unit_mm: float) -> tuple[float, float, float, float, float]:
         """Return middle, sides and yaw of the box seen from above, in units and degrees."""

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
 from marl_pack.exact.bins import ExactBins, placements
+from marl_pack.exact.explaining import explain
 from marl_pack.exact.goods import AXES, Goods, ThinError, fitting, joined
 from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.present import Present, check_present
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.support import Support, measure
+from marl_pack.explanation import Explanation
 from marl_pack.files import write_json
 from marl_pack.inputs import read_json
 from marl_pack.option_record import document
@@ -42,6 +44,7 @@ class _Offer:
     item: Goods  # the box with the orientations in which it fits
     answer: Placement | NoPlace
     move: int = -1
+    explanation: Explanation | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ class Packer:
             :class:`marl_pack.exact.packing.ExactPacking`; by default what was shown so far.
         grid_mm: edge of the cells on which agents trained on cells see the bin.
         seed: seed of ``random`` and ``search``.
+        explain: whether the plan says why each box is where it is
+            (:class:`marl_pack.explanation.Explanation`).
         **options: options that replace those in ``spec``:
         {options}
 
@@ -102,6 +107,7 @@ class Packer:
         catalogue: Any = None,
         grid_mm: float | None = None,
         seed: int = 0,
+        explain: bool = False,
         **options: Any,
     ) -> None:
         if not (spec is None or isinstance(spec, ExactSpec)):
@@ -114,6 +120,7 @@ class Packer:
         self.arguments = {
             "policy": policy, "bins": self.most_bins, "open_next": open_next, "plan": plan,
             "catalogue": catalogue, "grid_mm": grid_mm, "seed": seed,
+            "explain": truth_value(explain, "explain"),
         }  # fmt: skip
         self.present = check_present(present, self.spec)
         self.policy: PackerPolicy = make_packer_policy(
@@ -182,7 +189,7 @@ class Packer:
         """
         offer = self._offer(self._goods(sides, attributes), order)
         if isinstance(offer.answer, Placement):
-            self._do(Placed(offer.item, offer.answer.bin, offer.move, order))
+            self._do(Placed(offer.item, offer.answer.bin, offer.move, order, offer.explanation))
         return offer.answer
 
     def skip(self, sides: Sequence[float], *, order: str = "", **attributes: Any) -> NoPlace:
@@ -287,6 +294,7 @@ class Packer:
             margins=np.array([np.nan if p.margin is None else p.margin for p in placed]),
             left_out=tuple(self.left_out),
             orders=tuple(self.orders) if any(self.orders) else (),
+            explanations=tuple(box.explanation for box in boxes if self.arguments["explain"]),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -377,7 +385,7 @@ class Packer:
         row = _row_of(item, call.move)
         answer = self._answer(item, row, call.move & 7, self._support(item, row))
         self._shown.append(item)
-        self._add(item, row, answer)
+        self._add(item, row, answer, explanation=call.explanation)
 
     def _check_next(self) -> None:
         """Refuse to open the next bin if the open one is empty, or all bins are used.
@@ -400,13 +408,13 @@ class Packer:
 
     def _add(
         self, item: Goods, row: NDArray[np.int64], answer: Placement,
-        planned: Placement | None = None,
+        planned: Placement | None = None, explanation: Explanation | None = None,
     ) -> None:  # fmt: skip
         """Add a box at a row to the open bin."""
         self.bin.add(row[None], item, np.ones(1, np.bool_))
         unit = self.spec.unit_mm
         middle = answer.centre[0] / unit, answer.centre[1] / unit
-        self.packed[-1].append(Packed(item, answer, planned or answer, row, middle))
+        self.packed[-1].append(Packed(item, answer, planned or answer, row, middle, explanation))
 
     def _apply_reported(self, pose: Pose) -> None:
         """Move the last box of the open bin to the pose that a robot reported."""
@@ -430,7 +438,7 @@ class Packer:
         )  # fmt: skip
         self.bin = without
         self.packed[-1] = others
-        self._add(last.item, row, answer, planned)
+        self._add(last.item, row, answer, planned, last.explanation)
 
     # --- offers -----------------------------------------------------------------------------------
 
@@ -458,8 +466,14 @@ class Packer:
             self._offered = _Offer(item, order, able, *self._choose(able, order))
         return self._offered
 
-    def _choose(self, item: Goods, order: str) -> tuple[Placement | NoPlace, int]:
-        """Choose a place in the open bin or, if there is none, in the next one."""
+    def _choose(
+        self, item: Goods, order: str
+    ) -> tuple[Placement | NoPlace, int, Explanation | None]:
+        """Choose a place in the open bin or, if there is none, in the next one.
+
+        Returns:
+            The answer, the move (-1: no place) and, if it is asked for, the explanation.
+        """
         more = self.most_bins is None or len(self.packed) < self.most_bins
         empty = not self.packed[-1]
         fits_order = self._fits_order(order)
@@ -475,11 +489,12 @@ class Packer:
                 raise ValueError(f"the policy chose a move that is not legal: {move}")
             row = _row_of(item, move)
             support = measure(bin, row, float(bin.weights_of(item)[0][0]), bin.blocked(0, item))
-            return self._answer(item, row, move & 7, support, k), move
+            why = explain(self.policy, turn, 0, move) if self.arguments["explain"] else None
+            return self._answer(item, row, move & 7, support, k), move, why
         if not bins:
             bins_used = f"all {self.most_bins} bins are used"
-            return _no(item, "other_order", f"it begins an order, and {bins_used}"), -1
-        return why_not(self.bin if fits_order else bins[len(self.packed)], item), -1
+            return _no(item, "other_order", f"it begins an order, and {bins_used}"), -1, None
+        return why_not(self.bin if fits_order else bins[len(self.packed)], item), -1, None
 
     def _support(self, item: Goods, row: NDArray[np.int64]) -> Support:
         """Measure the support of a box at a row of the open bin."""
