@@ -29,7 +29,7 @@ from marl_pack.packer.packer import Packer
 from marl_pack.packer.reasons import why_not
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import save_plan
-from marl_pack.terminal import make_progress, make_status
+from marl_pack.terminal import make_progress
 
 SHOWN = 20  # boxes without a place that are listed
 TINY = 10  # times that the longest side of all boxes goes into the bin's shortest: a wrong unit?
@@ -152,23 +152,16 @@ def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
     return refused
 
 
-def save_pictures(feed: Feed, console: Console) -> None:
-    """Draw each bin to a file of its own."""
-    from marl_pack.render.animation import save_gif
-    from marl_pack.render.picture import draw_plan, save
+def save_picture(feed: Feed, console: Console) -> None:
+    """Draw the bins, or how they were packed."""
+    from marl_pack.render.animation import Film, save_film
 
-    plan, path = feed.packer.plan, feed.chosen.picture
-    count = len(plan.bin_sizes)
-    with make_status(console, "drawing"):
-        for k in range(count):
-            file = path if count == 1 else path.with_stem(f"{path.stem}-{k}")
-            packed = plan.in_bin(k)
-            title = f"{feed.chosen.policy}, bin {k}: {len(packed)} boxes"
-            if path.suffix.lower() == ".gif":
-                save_gif(file, packed, title)
-            else:
-                save(file, draw_plan(packed, f"{title}, {packed.utilization:.1%} filled"))
-    console.print(f"pictures: {path}" + (f" (-0 … -{count - 1})" if count > 1 else ""))
+    path = feed.chosen.picture
+    film = Film(feed.packer.plan, feed.chosen.policy)
+    with make_progress(console) as bar:
+        task = bar.add_task("pictures", total=1 if path.suffix.lower() == ".png" else len(film))
+        save_film(path, film, progress=lambda: bar.advance(task))
+    console.print(f"picture: {path}", soft_wrap=True)
 
 
 def _count(number: int, one: str, many: str) -> str:

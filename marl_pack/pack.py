@@ -21,7 +21,7 @@ from marl_pack.options import MM_POLICIES, NEXT_BIN, NO_PLACE, add_explain, chec
 from marl_pack.plan_archive import check_ending
 from marl_pack.terminal import Parser, announce_compiling, make_console
 
-PICTURES = (".png", ".gif")
+PICTURES = (".png", ".gif", ".mp4")
 PROGRAM = "python -m marl_pack.pack"
 NOTE = """\
 columns of a file, keys of a line: w_mm, d_mm, h_mm; and, if you like, id, quantity, weight_kg,
@@ -87,8 +87,7 @@ def parser(program: str = PROGRAM) -> Parser:
         help="write the plan to this .json, .csv or .npz file while boxes are packed",
     )
     add("--picture", type=Path, metavar="FILE",
-        help="draw the packed bin (.png), or how it was packed (.gif); with several bins, one file "
-             "each, FILE-0, FILE-1, …")  # fmt: skip
+        help="draw the packed bins (.png), or how they were packed (.gif, .mp4)")  # fmt: skip
     add_explain(group, "--out")
     add("--state", type=Path, metavar="FILE",
         help="with -: save the packer to this .json file before each answer; if the file exists, "
@@ -112,7 +111,7 @@ def run(chosen: argparse.Namespace) -> int:
     if chosen.explain:
         check_explain(chosen.out, "--out")
     if chosen.picture is not None and chosen.picture.suffix.lower() not in PICTURES:
-        raise ValueError(f"--picture {chosen.picture}: needs the ending .png or .gif")
+        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(PICTURES)}")
     for path in (chosen.out, chosen.state, chosen.picture):
         if path is not None:
             check_writable(path)
@@ -129,7 +128,7 @@ def run(chosen: argparse.Namespace) -> int:
         if feeding.times:
             feed.show(feeding, console)
     if chosen.picture is not None:
-        feed.save_pictures(feeding, console)
+        feed.save_picture(feeding, console)
     return refused
 
 
@@ -141,7 +140,7 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
         refused = run(chosen)
     except KeyboardInterrupt:
         options.exit(130, f"{options.prog}: interrupted")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         options.exit(2, f"{options.prog}: {error}")
     if refused:
         options.exit(2, f"{options.prog}: {refused} lines were refused; the answers say why")

@@ -24,6 +24,7 @@ from marl_pack.plan_archive import check_ending, save_plan
 from marl_pack.terminal import Parser, make_console, make_status
 
 PROGRAM = "python -m marl_pack.play"
+PICTURES = (".png", ".gif", ".mp4")
 
 
 def parser(program: str = PROGRAM) -> Parser:
@@ -44,7 +45,7 @@ def parser(program: str = PROGRAM) -> Parser:
     add = group.add_argument
     add("--picture", type=Path, default=Path("play.png"),
         help="file for a picture of the packed bin (.png), or an animation of how it was packed "
-             "(.gif) (default: play.png)")  # fmt: skip
+             "(.gif, .mp4) (default: play.png)")  # fmt: skip
     add("--save", type=Path, metavar="FILE",
         help="write the packed boxes to this file (.json, .csv or .npz)")  # fmt: skip
     add_explain(group, "--save")
@@ -57,8 +58,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
-    if chosen.picture.suffix.lower() not in (".png", ".gif"):
-        raise ValueError(f"--picture {chosen.picture}: needs the ending .png or .gif")
+    if chosen.picture.suffix.lower() not in PICTURES:
+        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(PICTURES)}")
     check_writable(chosen.picture)
     if chosen.save is not None:
         check_ending(chosen.save, "--save")
@@ -110,7 +111,7 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
 
     from matplotlib.image import imsave
 
-    from marl_pack.render.animation import save_gif
+    from marl_pack.render.animation import Film, save_film
     from marl_pack.render.picture import draw
 
     (plan,) = reasons.of([Plan.from_bins(game.bins.to("cpu"), 0)])
@@ -118,8 +119,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)
     with make_status(console, "drawing the bin"):
-        if chosen.picture.suffix.lower() == ".gif":
-            save_gif(chosen.picture, plan, name)
+        if chosen.picture.suffix.lower() != ".png":
+            save_film(chosen.picture, Film(plan, name))
         else:
             image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
             write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
@@ -137,7 +138,7 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
         run(chosen, make_console())
     except KeyboardInterrupt:
         options.exit(130, f"{options.prog}: interrupted")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         options.exit(2, f"{options.prog}: {error}")
     return 0
 

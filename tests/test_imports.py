@@ -18,7 +18,7 @@ LAYERS = (
     ("exact",),
     ("game",),
     ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
-    ("packer",),
+    ("packer", "replay"),
     ("evaluation",),
     # The programs, and what only they use.
     ("cli", "compile", "config", "evaluate", "export", "feed", "integrations", "options", "pack",
@@ -37,7 +37,8 @@ ONLY = {
               "option_record", "plan", "renamed", "sapien_check", "stability"},
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
              "option_record", "renamed", "stability"},
-    "render": {"bins", "files", "geometry", "plan", "render"},
+    "render": {"bins", "extras", "files", "geometry", "plan", "render"},
+    "replay": {"checks", "files", "plan", "plan_archive", "render", "replay", "terminal"},
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from matplotlib.image import imread
 from PIL import Image, ImageSequence
 
 from marl_pack.plan import Plan
-from marl_pack.render.animation import save_gif
+from marl_pack.render.animation import Film, save_film
 from marl_pack.render.picture import PALETTE, draw, paint_order, save
 
 SIZE = (10, 10, 10)
@@ -227,10 +227,11 @@ def test_a_title_is_drawn_as_it_is() -> None:
 
 def test_an_animation_shows_every_placement_and_keeps_the_bin_in_its_place(tmp_path) -> None:
     boxes = np.array([(0, 0, 0, 4, 4, 2), (0, 0, 2, 4, 4, 2), (0, 4, 0, 2, 2, 3)])
-    save_gif(tmp_path / "bin.gif", Plan.of_boxes((8, 8, 8), boxes), "a policy")
-    with Image.open(tmp_path / "bin.gif") as film:
+    film = Film(Plan.of_boxes((8, 8, 8), boxes), "a policy")
+    save_film(tmp_path / "bin.gif", film)
+    with Image.open(tmp_path / "bin.gif") as images:
         frames = [
-            np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film)
+            np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(images)
         ]
     assert len(frames) == len(boxes) + 1
     floor = [np.argwhere((frame == 232).all(2))[:, 0].max() for frame in frames]

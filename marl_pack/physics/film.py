@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from marl_pack.extras import missing
 from marl_pack.files import check_writable, moved_into_place
-from marl_pack.render.picture import PALETTE
+from marl_pack.render.colours import PALETTE
 from marl_pack.sapien_check.stack import Floats, Stack
 from marl_pack.sapien_check.world import DEFAULT, Pass, Physics, World
 

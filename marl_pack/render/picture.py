@@ -25,12 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.files import moved_into_place
 from marl_pack.plan import Plan
-
-PALETTE: tuple[str, ...] = (
-    "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
-    "#ff9da7", "#a0cbe8", "#ffbe7d", "#8cd17d", "#d4a6c8", "#d7b5a6", "#499894", "#b6992d",
-)  # fmt: skip
-"""Colours of the boxes, in order of placement; after the last colour the first one comes again."""
+from marl_pack.render.colours import PALETTE
 
 LEGAL = "#18a558"
 """Colour of the cells where the item may be placed."""
@@ -154,10 +149,17 @@ def drawable(plan: Plan) -> Drawable:
     raise ValueError("a picture needs lengths of at most four decimals")
 
 
-def draw_plan(plan: Plan, title: str = "") -> NDArray[np.uint8]:
+def draw_plan(
+    plan: Plan,
+    title: str = "",
+    pixels: tuple[int, int] = (960, 600),
+    colours: Sequence[str] = PALETTE,
+) -> NDArray[np.uint8]:
     """Draw a plan of one bin (:func:`draw`)."""
     whole = drawable(plan)
-    return draw(whole.size, whole.boxes, title=title, parts=whole.parts)
+    return draw(
+        whole.size, whole.boxes, title=title, pixels=pixels, parts=whole.parts, colours=colours
+    )
 
 
 def draw(
@@ -170,6 +172,7 @@ def draw(
     pixels: tuple[int, int] = (960, 600),
     leave_space: bool = False,
     parts: int = 1,
+    colours: Sequence[str] = PALETTE,
 ) -> NDArray[np.uint8]:
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
 
@@ -188,6 +191,8 @@ def draw(
         leave_space: whether to leave space for an item even without one, so that the bin is at
             the same place in every picture.
         parts: the numbers on the picture are lengths divided by this.
+        colours: "#rrggbb" of the boxes in order, then of the item; after the last colour the first
+            one comes again.
 
     Returns:
         uint8 [rows, columns, 3], RGB.
@@ -208,9 +213,9 @@ def draw(
     beside = 0.28 if masks is None else 0.18
     left = 0.05 if item is None and not leave_space else beside + 0.04
     right = 0.93 if masks is None else 0.61
-    scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked, parts)
+    scale = _draw_bin(figure, (left, 0.10, right - left, 0.80), size, checked, parts, colours)
     if item is not None:
-        colour = PALETTE[len(boxes) % len(PALETTE)]
+        colour = colours[len(boxes) % len(colours)]
         _draw_item(figure, (0.01, 0.36, beside, 0.40), item, colour, scale, parts)
     if masks is not None:
         legend = "green: where the item's low corner may lie"
@@ -275,6 +280,7 @@ def _draw_bin(
     size: tuple[int, int, int],
     boxes: NDArray[np.int64],
     parts: int,
+    colours: Sequence[str],
 ) -> float:
     """Draw the bin in 3D so that it fills ``rect``, and return its scale in pixels per cell."""
     axes, scale = _axes(figure, rect, size)
@@ -282,7 +288,7 @@ def _draw_bin(
     near = (_EDGES == (1, 0, 1)).all(-1).any(-1)  # edges that lie in front of all boxes
     axes.add_collection(PolyCollection([_project(_FLOOR * size)], facecolors="#e8e8e8"))
     _add_lines(axes, edges[~near], _FAINT, 0.9)
-    _add_boxes(axes, boxes)
+    _add_boxes(axes, boxes, colours)
     _add_lines(axes, edges[near], _FAINT, 0.6)
     if len(boxes):  # the outline of the last box, where others hide it
         visible = (_EDGES != (0, 1, 0)).any(-1).all(-1)
@@ -424,7 +430,7 @@ def _add_lines(
 def _add_boxes(
     axes: Axes,
     boxes: NDArray[np.int64],
-    colours: Sequence[str] = PALETTE,
+    colours: Sequence[str],
     last_edge: float = 2.4,
 ) -> None:
     """Add the visible faces of boxes, the last box with edges ``last_edge`` points wide."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.plan import Plan
-from marl_pack.plan_columns import BOX, EXTRAS
+from marl_pack.render.colours import COLOURINGS, PALETTE, SCALE, UNKNOWN, colour_plan
 
 ROUNDING = 1e-6
 """Share of a bin's height by which faces that touch may differ."""
@@ -26,14 +26,20 @@ def make_document(plan: Plan, title: str = "") -> dict[str, Any]:
         The keys of :meth:`marl_pack.plan.Plan.to_dict`, and ``title``, ``unit`` (name of the unit
         of lengths) and in each box ``rests_on`` (numbers of the boxes that it touches from above)
         and ``support`` (share of its footprint that touches what is below). The margin is only
-        there if the plan has it, since it depends on the stability rule.
+        there if the plan has it, since it depends on the stability rule. ``colours`` has the
+        colours of the boxes, by what they show (:mod:`marl_pack.render.colours`).
     """
     content = plan.to_dict()
     supporters, shares = contacts(plan)
     for box, below, share in zip(content["boxes"], supporters, shares.tolist(), strict=True):
         box["rests_on"] = below
         box.setdefault("support", share)
-    return {"title": title, "unit": unit_name(plan.unit_mm), **content}
+    colourings = {by: colour_plan(plan, by) for by in COLOURINGS}
+    colours = {by: asdict(of) for by, of in colourings.items() if of is not None}
+    return {
+        "title": title, "unit": unit_name(plan.unit_mm), "palette": PALETTE, "scale": SCALE,
+        "unknown": UNKNOWN, "colours": colours, **content,
+    }  # fmt: skip
 
 
 def unit_name(unit_mm: float | None) -> str:
@@ -72,22 +78,3 @@ def contacts(plan: Plan) -> tuple[list[list[int]], NDArray[np.float64]]:
         footprint = float(plan.sides[i, 0]) * float(plan.sides[i, 1])
         shares[i] = min(1.0, float(area[touching].sum()) / footprint)
     return supporters, shares
-
-
-def load_on(plan: Plan, index: int, supporters: Sequence[Sequence[int]]) -> float:
-    """Return the weight of all boxes that rest on one box, directly or through others.
-
-    Args:
-        plan: the boxes.
-        index: number of the box.
-        supporters: the first result of :func:`contacts`.
-    """
-    above = {index}
-    for i, below in enumerate(supporters):
-        if above.intersection(below):
-            above.add(i)
-    return float(plan.weights[sorted(above - {index})].sum())
-
-
-SHOWN = (*BOX, *(extra.key for extra in EXTRAS))
-"""Values of a box that the page can show."""

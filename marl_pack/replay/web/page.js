@@ -1,0 +1,353 @@
+// The page: its controls, and what they change.
+"use strict";
+
+const STEP_MS = 900;
+const LIVE_MS = 1000;
+const UPCOMING = 14; // boxes on the conveyor that are drawn
+const NAMED = 12; // colours in the legend
+const $ = (id) => document.getElementById(id);
+
+class Page {
+  constructor(doc) {
+    this.step = 0;
+    this.selected = -1;
+    this.hovered = -1;
+    this.why = new WhyPanel((placement) => this.view?.showGhost(placement));
+    this.load(doc);
+    const asked = new URLSearchParams(location.hash.slice(1));
+    this.goTo(asked.has("step") ? Number(asked.get("step")) : this.model.last);
+    for (const id of ["colour", "bin"]) {
+      const known = [...$(id).options].some((option) => option.value === asked.get(id));
+      if (known) $(id).value = asked.get(id);
+    }
+    this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    this.openView();
+    this.listen();
+    this.show();
+    const live = document.documentElement.dataset.live;
+    if (live) this.follow(live);
+  }
+
+  /** Take a new document. */
+  load(doc) {
+    this.model = new Model(doc);
+    document.title = doc.title || "Replay";
+    $("title").textContent = doc.title || "Replay";
+    $("slider").max = this.model.last;
+    const [colour, bin] = [$("colour").value, $("bin").value];
+    const colourings = this.model.colourings;
+    options($("colour"), colourings.map((name) => [name, name]), colourings.includes(colour) ? colour : "item");
+    const bins = this.model.bins.map((_, k) => [k, this.model.orders[k] ? `${k + 1}: ${this.model.orders[k]}` : `${k + 1}`]);
+    const many = bins.length > 1;
+    options($("bin"), many ? [["open", "open one"], ["all", "all"], ...bins] : [["all", "all"]], many ? bin || "open" : "all");
+    if ($("bin").selectedIndex < 0) $("bin").selectedIndex = 0;
+    $("bin-label").hidden = !many;
+    const left = doc.left_out ?? [];
+    $("left-out").hidden = !left.length;
+    $("left-out").querySelector("ul").replaceChildren(...left.map((box) =>
+      element("li", `${box.id || "box"} (${[box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × ")}): ${box.reason}`)));
+    fillTable($("boxes"), ["box", "size", "position", "kg"], this.model.boxes.map((box, i) => ({
+      cells: [
+        `${i + 1} ${box.id}`, [box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × "),
+        [box.x, box.y, box.z].map((v) => this.model.length(v)).join(", "), plain(box.weight),
+      ],
+      press: () => {
+        this.goTo(Math.max(this.step, i + 1));
+        this.select(i);
+      },
+    })));
+    if (this.model.doc.unit_mm === null) $("boxes").tHead.querySelector("th:last-child").textContent = "weight";
+  }
+
+  openView() {
+    try {
+      this.view = new View3D($("view"), this.model);
+      this.setTheme(document.documentElement.dataset.theme);
+    } catch (error) {
+      console.warn(error);
+      $("no-webgl").hidden = false;
+      $("view").hidden = true;
+    }
+  }
+
+  /** Go to a step; a step outside the plan becomes the nearest one. */
+  goTo(step, drop = false) {
+    this.step = Math.min(this.model.last, Math.max(0, Math.round(step) || 0));
+    if (this.selected >= this.step) this.selected = -1;
+    if (this.hovered >= this.step) this.hovered = -1;
+    this.show(drop);
+  }
+
+  /** The bin that is shown: a number, or null for all. */
+  get bin() {
+    const { value } = $("bin");
+    if (value === "open") return this.model.openBin(this.step);
+    return value === "all" ? (this.model.bins.length === 1 ? 0 : null) : Number(value);
+  }
+
+  /** The box whose values are shown: under the pointer, selected, or placed last. */
+  get subject() {
+    if (this.hovered >= 0) return this.hovered;
+    return this.selected >= 0 ? this.selected : this.step - 1;
+  }
+
+  show(drop = false) {
+    const { model, step } = this;
+    $("slider").value = step;
+    $("slider").setAttribute("aria-valuetext", model.caption(step));
+    $("caption").textContent = model.caption(step);
+    $("view").setAttribute("aria-label", `Bins in 3D. ${model.caption(step)}`);
+    for (const id of ["first", "back"]) $(id).disabled = step === 0;
+    for (const id of ["forward", "last"]) $(id).disabled = step === model.last;
+    if (this.view) {
+      const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+      this.view.setBin(this.bin);
+      this.view.show(step, $("colour").value, this.subject, drop && !calm);
+    }
+    this.showLegend();
+    this.showConveyor();
+    const rows = model.binsAt(step);
+    const kilograms = model.doc.unit_mm === null ? "weight" : "kg";
+    fillTable($("bins"), ["bin", "boxes", "filled", "top", kilograms], rows.map((row, k) => ({
+      cells: [
+        model.orders[k] ? `${k + 1} (${model.orders[k]})` : `${k + 1}`, `${row.boxes}`,
+        percent(row.utilization, 1), model.length(row.top), plain(row.weight, 1),
+      ],
+      chosen: rows.length > 1 && k === model.openBin(step),
+    })));
+    this.showSubject();
+    history.replaceState(null, "", `#${new URLSearchParams({ step, colour: $("colour").value, bin: $("bin").value })}`);
+  }
+
+  showSubject() {
+    const i = this.subject;
+    $("box-heading").textContent = i < 0 ? "Box" : `Box ${i + 1}${i === this.step - 1 ? ", placed last" : ""}`;
+    $("box").replaceChildren(...(i < 0 ? [element("dd", "No box is placed yet.")] : valueList(this.model.values(i, this.step))));
+    this.view?.mark(i);
+    this.why.show(this.model, this.selected >= 0 ? this.selected : this.step - 1);
+  }
+
+  select(i) {
+    this.selected = i < this.step ? i : -1;
+    this.showSubject();
+  }
+
+  showLegend() {
+    const { model } = this;
+    const colouring = $("colour").value;
+    const legend = $("legend");
+    legend.replaceChildren();
+    const { names, range } = model.doc.colours[colouring];
+    names.slice(0, NAMED).forEach((name, k) => {
+      const swatch = element("span", "", "swatch");
+      swatch.style.background = model.doc.palette[k % model.doc.palette.length];
+      legend.append(swatch, name);
+    });
+    if (names.length > NAMED) legend.append(` + ${names.length - NAMED} more`);
+    if (range) {
+      const unit = colouring === "margin" ? ` ${model.unit}` : model.doc.unit_mm === null ? "" : " kg";
+      const scale = element("span", "", "scale");
+      scale.style.background = `linear-gradient(90deg, ${model.doc.scale.join(", ")})`;
+      legend.append(`${colouring} ${plain(range[0], 1)}`, scale, `${plain(range[1], 1)}${unit}`);
+    }
+  }
+
+  showConveyor() {
+    const coming = this.model.boxes.slice(this.step, this.step + UPCOMING);
+    const longest = Math.max(...this.model.boxes.map((box) => Math.max(box.w, box.d, box.h)), 1e-9);
+    const strip = $("conveyor");
+    strip.replaceChildren(...coming.map((box, k) => {
+      const figure = element("figure", "", k === 0 ? "next" : "");
+      const sides = this.model.ownSides(box);
+      figure.append(boxPicture(sides, longest, this.model.colour(this.step + k, $("colour").value)));
+      figure.append(element("figcaption", box.id || sides.map((v) => this.model.length(v)).join("×")));
+      figure.title = `${box.id} ${sides.map((v) => this.model.length(v)).join(" × ")} ${this.model.unit}`;
+      return figure;
+    }));
+    const rest = this.model.last - this.step - coming.length;
+    if (rest > 0) strip.append(element("p", `+ ${rest} more`));
+    if (!coming.length) strip.append(element("p", "No more boxes."));
+  }
+
+  setTheme(theme) {
+    document.documentElement.dataset.theme = theme;
+    const style = getComputedStyle(document.documentElement);
+    const names = ["stage", "floor", "wire", "ink", "accent"];
+    this.view?.setColours(Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()])));
+    this.why.i = undefined; // its map has other colours now
+    this.why.show(this.model, this.selected >= 0 ? this.selected : this.step - 1);
+  }
+
+  toggleTheme() {
+    this.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  }
+
+  get playing() {
+    return this.timer !== undefined;
+  }
+
+  togglePlay(on = !this.playing) {
+    clearTimeout(this.timer);
+    this.timer = undefined;
+    if (on) {
+      if (this.step === this.model.last) this.goTo(0);
+      const tick = () => {
+        this.goTo(this.step + 1, true);
+        if (this.step === this.model.last) this.togglePlay(false);
+        else this.timer = setTimeout(tick, STEP_MS / Number($("speed").value));
+      };
+      this.timer = setTimeout(tick, STEP_MS / Number($("speed").value));
+    }
+    $("play-word").textContent = on ? "Pause" : "Play";
+    $("play").classList.toggle("playing", on);
+  }
+
+  /** Choose the next option of a <select>. */
+  next(select) {
+    select.selectedIndex = (select.selectedIndex + 1) % select.options.length;
+    this.show();
+  }
+
+  listen() {
+    const stepTo = (step, drop) => {
+      this.togglePlay(false);
+      this.goTo(step, drop);
+    };
+    $("first").addEventListener("click", () => stepTo(0));
+    $("back").addEventListener("click", () => stepTo(this.step - 1));
+    $("play").addEventListener("click", () => this.togglePlay());
+    $("forward").addEventListener("click", () => stepTo(this.step + 1, true));
+    $("last").addEventListener("click", () => stepTo(this.model.last));
+    $("slider").addEventListener("input", () => stepTo(Number($("slider").value)));
+    for (const id of ["colour", "bin"]) $(id).addEventListener("change", () => this.show());
+    $("reset").addEventListener("click", () => this.view?.reset());
+    $("theme").addEventListener("click", () => this.toggleTheme());
+    $("help").addEventListener("click", () => $("keys").showModal());
+    const keys = {
+      " ": () => this.togglePlay(),
+      ArrowLeft: () => stepTo(this.step - 1), ArrowRight: () => stepTo(this.step + 1, true),
+      Home: () => stepTo(0), End: () => stepTo(this.model.last),
+      "+": () => this.view?.zoom(1.2), "=": () => this.view?.zoom(1.2), "-": () => this.view?.zoom(1 / 1.2),
+      a: () => this.view?.turn(0.15, 0), d: () => this.view?.turn(-0.15, 0),
+      w: () => this.view?.turn(0, 0.12), s: () => this.view?.turn(0, -0.12),
+      r: () => this.view?.reset(), c: () => this.next($("colour")), b: () => this.next($("bin")),
+      t: () => this.toggleTheme(), "?": () => $("keys").showModal(), Escape: () => this.select(-1),
+    };
+    document.addEventListener("keydown", (event) => {
+      const inside = event.target.closest("input, select, button, summary, dialog");
+      const own = inside && (event.key.length > 1 || event.key === " " || inside.matches("select, dialog"));
+      if (event.ctrlKey || event.metaKey || event.altKey || (own && event.key !== "Escape") || $("keys").open) return;
+      if (!Object.hasOwn(keys, event.key)) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+    this.listenToPointer();
+  }
+
+  listenToPointer() {
+    const view = $("view");
+    let pressed = null;
+    view.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
+    view.addEventListener("pointermove", (event) => {
+      if (event.buttons || !this.view) return;
+      this.hover(this.view.pick(event.offsetX, event.offsetY), event.offsetX, event.offsetY);
+    });
+    view.addEventListener("pointerleave", () => this.hover(-1));
+    view.addEventListener("click", (event) => {
+      const still = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 5;
+      if (still && this.view) this.select(this.view.pick(event.offsetX, event.offsetY));
+    });
+  }
+
+  hover(i, x = 0, y = 0) {
+    const tooltip = $("tooltip");
+    tooltip.hidden = i < 0;
+    if (i >= 0) {
+      if (i !== this.hovered) {
+        const list = document.createElement("dl");
+        list.append(...valueList(this.model.values(i, this.step)));
+        tooltip.replaceChildren(list);
+      }
+      const stage = $("stage").getBoundingClientRect();
+      tooltip.style.left = `${Math.max(4, Math.min(x + 14, stage.width - tooltip.offsetWidth - 4))}px`;
+      tooltip.style.top = `${Math.max(4, Math.min(y + 14, stage.height - tooltip.offsetHeight - 4))}px`;
+    }
+    if (i === this.hovered) return;
+    this.hovered = i;
+    this.showSubject();
+  }
+
+  /** Ask again and again for a plan that still grows. */
+  async follow(url) {
+    $("live").hidden = false;
+    let before = "";
+    for (;;) {
+      try {
+        const answer = await fetch(url, { cache: "no-store" });
+        if (!answer.ok) throw new Error(`status ${answer.status}`);
+        const text = await answer.text();
+        $("live").textContent = "live";
+        $("live").classList.remove("lost");
+        if (text !== before) {
+          const atEnd = this.step === this.model.last;
+          const grown = before !== "";
+          before = text;
+          this.load(JSON.parse(text));
+          this.view?.setModel(this.model);
+          this.setTheme(document.documentElement.dataset.theme);
+          this.goTo(atEnd && !this.playing ? this.model.last : this.step, grown && atEnd);
+        }
+      } catch (error) {
+        console.warn(error);
+        $("live").textContent = "connection lost";
+        $("live").classList.add("lost");
+      }
+      await new Promise((resolve) => setTimeout(resolve, LIVE_MS));
+    }
+  }
+}
+
+/** The elements of a list of values. */
+function valueList(rows) {
+  return rows.flatMap(([key, label, text, bad]) => {
+    const value = element("dd", text, bad ? "bad" : "");
+    value.dataset.key = key;
+    return [element("dt", label), value];
+  });
+}
+
+/** A picture of a box of given sides, as SVG. */
+function boxPicture([w, d, h], longest, colour) {
+  const scale = 30 / longest;
+  const [right, back] = [[0.9, 0.35], [0.55, -0.42]];
+  const point = (x, y, z) => [x * w * right[0] + y * d * back[0], x * w * right[1] + y * d * back[1] - z * h];
+  const faces = [
+    [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], 0.82], [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1], 0.65],
+    [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], 1],
+  ];
+  const all = CORNERS.map((corner) => point(...corner));
+  const [left, top] = [0, 1].map((k) => Math.min(...all.map((p) => p[k])));
+  const size = [0, 1].map((k) => scale * (Math.max(...all.map((p) => p[k])) - [left, top][k]) + 2);
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  svg.setAttribute("width", size[0]);
+  svg.setAttribute("height", size[1]);
+  svg.setAttribute("aria-hidden", "true");
+  for (const [a, b, c, e, light] of faces) {
+    const shape = document.createElementNS("http://www.w3.org/2000/svg", "polygon");
+    const points = [a, b, c, e].map((corner) => point(...corner).map((v, k) => (scale * (v - [left, top][k]) + 1).toFixed(1)));
+    shape.setAttribute("points", points.map((p) => p.join(",")).join(" "));
+    shape.setAttribute("fill", shaded(colour, light));
+    shape.setAttribute("stroke", "#20242a");
+    shape.setAttribute("stroke-width", "0.6");
+    svg.append(shape);
+  }
+  return svg;
+}
+
+/** A colour "#rrggbb" made darker. */
+function shaded(colour, light) {
+  const parts = [1, 3, 5].map((k) => Math.round(parseInt(colour.slice(k, k + 2), 16) * light));
+  return `rgb(${parts.join(" ")})`;
+}
+
+window.page = new Page(JSON.parse($("document").textContent));
