@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds fuzz mutations trainers play configs train benchmark results docs pages clean
+.PHONY: help setup test check bounds browser three fuzz mutations trainers play configs train benchmark results docs pages clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -31,6 +31,12 @@ bounds: $(STAMP)  ## the tests of compiled code, with every array access checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/bounds $(BIN)/python -m pytest -n 2 tests/test_bins.py \
 	  tests/test_exact_game.py tests/test_exact_rules.py tests/test_exact_search.py tests/test_items.py tests/test_packing.py \
 	  tests/test_stability_rules.py tests/test_stability_properties.py
+
+browser: $(STAMP)  ## the replay page in a headless browser, which has to be installed
+	$(BIN)/python -m pytest -v tests/browser
+
+three:  ## bundle three.js into the replay page again; needs Node.js
+	cd marl_pack/replay/web && npm ci --ignore-scripts && node node_modules/esbuild/install.js && npm run bundle
 
 fuzz: $(STAMP)  ## bad and hard input at random, for MINUTES=20
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)

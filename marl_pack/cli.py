@@ -15,6 +15,7 @@ import marl_pack
 from marl_pack.terminal import Parser
 
 COMMANDS = {
+    "demo": ("marl_pack.demo", "pack a pallet of cases, and look at it in the browser"),
     "train": ("marl_pack.train", "train the two agents, or resume a run"),
     "evaluate": ("marl_pack.evaluate", "play many games; print and save how full the bins are"),
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),

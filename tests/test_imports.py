@@ -21,8 +21,8 @@ LAYERS = (
     ("packer", "replay"),
     ("evaluation",),
     # The programs, and what only they use.
-    ("cli", "compile", "config", "evaluate", "export", "feed", "integrations", "options", "pack",
-     "physics", "play",
+    ("cli", "compile", "config", "demo", "evaluate", "export", "feed", "integrations", "options",
+     "pack", "physics", "play",
      "players", "players_mm", "train", "training", "tune"),
 )  # fmt: skip
 

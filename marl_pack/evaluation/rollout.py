@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.checks import whole_number
-from marl_pack.exact.explaining import explain as explain_mm
 from marl_pack.explanation import Explanation
 from marl_pack.plan import Plan
 
@@ -61,9 +60,9 @@ class Reasons:
             explanations: one for each game, None for games that have ended; or None for nothing.
             counts: number of boxes in each game after the placement.
         """
-        for own, explanation, count in zip(
-            self._games, explanations or (), counts if explanations else (), strict=True
-        ):
+        if explanations is None:
+            return
+        for own, explanation, count in zip(self._games, explanations, counts, strict=True):
             if explanation is not None and count > len(own):
                 own += [None] * (count - 1 - len(own))  # boxes that were there at the beginning
                 own.append(explanation)
@@ -149,6 +148,8 @@ def batches_mm(
     Raises:
         ValueError: unless ``episodes`` is a whole number ≥ 1.
     """
+    from marl_pack.exact.explaining import explain  # slow to import
+
     episodes = whole_number(episodes, "episodes", 1)
     for first in range(0, episodes, BATCH_MM):
         games = game(min(BATCH_MM, episodes - first), first)
@@ -160,7 +161,7 @@ def batches_mm(
             explanations = None
             if explained:
                 explanations = [
-                    explain_mm(policy, games, g, int(moves[g])) if alive else None
+                    explain(policy, games, g, int(moves[g])) if alive else None
                     for g, alive in enumerate(games.alive.tolist())
                 ]
             outcome = games.place(moves)

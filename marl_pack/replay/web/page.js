@@ -148,7 +148,7 @@ class Page {
       const unit = colouring === "margin" ? ` ${model.unit}` : model.doc.unit_mm === null ? "" : " kg";
       const scale = element("span", "", "scale");
       scale.style.background = `linear-gradient(90deg, ${model.doc.scale.join(", ")})`;
-      legend.append(`${colouring} ${plain(range[0], 1)}`, scale, `${plain(range[1], 1)}${unit}`);
+      legend.append(`${colouring} ${plain(range[0], 1)} `, scale, ` ${plain(range[1], 1)}${unit}`);
     }
   }
 
