@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TRAINERS ?= all
 MINUTES ?= 20
 
-.PHONY: help setup test check bounds browser three fuzz mutations trainers play configs train benchmark results docs pages clean
+.PHONY: help setup test check bounds browser three film fuzz mutations trainers play configs train benchmark results docs pages clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*##/ -/'
@@ -37,6 +37,9 @@ browser: $(STAMP)  ## the replay page in a headless browser, which has to be ins
 
 three:  ## bundle three.js into the replay page again; needs Node.js
 	cd marl_pack/replay/web && npm ci --ignore-scripts && node node_modules/esbuild/install.js && npm run bundle
+
+film: $(STAMP)  ## the film in the README and the pictures of docs/replay.md
+	$(BIN)/python -m docs.replay_pictures
 
 fuzz: $(STAMP)  ## bad and hard input at random, for MINUTES=20
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
