@@ -15,13 +15,13 @@ import marl_pack
 from marl_pack.terminal import Parser
 
 COMMANDS = {
-    "demo": ("marl_pack.demo", "pack a pallet of cases, and look at it in the browser"),
     "train": ("marl_pack.train", "train the two agents, or resume a run"),
     "evaluate": ("marl_pack.evaluate", "play many games; print and save how full the bins are"),
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),
     "export": ("marl_pack.export.command", "write trained agents as ONNX, or for rsl_rl"),
     "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
     "replay": ("marl_pack.replay.command", "show how a plan was packed: page, picture or film"),
+    "demo": ("marl_pack.demo", "pack a pallet of cases, and look at it in the browser"),
     "tune": ("marl_pack.tune", "find the weights of the heuristic linear for your own goods"),
     "compile": ("marl_pack.compile", "compile all code now, so that no later start has to wait"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),
