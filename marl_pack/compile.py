@@ -80,12 +80,14 @@ def _agents() -> None:
 
 
 def _environments() -> None:
-    """Play one episode of the PettingZoo environment."""
+    """Play the first turns of the PettingZoo environment."""
     from marl_pack import env_aec
 
     env = env_aec.env()
     env.reset(seed=0)
     for agent in env.agent_iter(2 * STEPS):
+        if env.terminations[agent]:  # the first boxes may leave no place for the next one
+            return
         mask = env.observe(agent)["action_mask"]
         env.step(env.action_space(agent).sample(mask))
 

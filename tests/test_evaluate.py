@@ -287,7 +287,7 @@ def test_play_shows_the_game_and_draws_it(
     assert play_command.main(["--picture", str(film)]) == 0
     assert film.read_bytes()[:6] == b"GIF89a"
     for wrong, why in (
-        (["--picture", "bin.xyz"], "ending .png or .gif"),
+        (["--picture", "bin.xyz"], "ending .png, .gif, .mp4"),
         (["--policy", "dblf", "random", "--picture", str(path)], "needs one policy"),
         (["--episode", "-1", "--picture", str(path)], "needs 0"),
     ):
