@@ -200,11 +200,27 @@ def render_packer(folder: Path = RESULTS) -> str:
     )  # fmt: skip
 
 
+def render_replay(folder: Path = RESULTS) -> str:
+    """Return the text of docs/replay.md; the arguments are those of :func:`render`."""
+    table = tables_in(folder)["page"]
+    rows = sorted(table.rows().values(), key=lambda row: row["boxes"])
+    lines = [
+        (f"{row['boxes']:,}", f"{row['bins']}", f"{row['kilobytes'] / 1000:.1f}",
+         f"{row['median_ms']:.0f}", f"{row['slowest_ms']:.0f}")
+        for row in rows
+    ]  # fmt: skip
+    head = ("boxes", "bins", "page, MB", "median, ms", "slowest of 7, ms")
+    text = f"{markdown_table(head, *lines)}\n\n{made(table)}"
+    page = PAGE.with_name("replay.md").read_text(encoding="utf-8")
+    return between(page, "opening", text)
+
+
 PAGES = {
     PAGE: render,
     PAGE.with_name("real_goods.md"): render_real_goods,
     PAGE.with_name("real_cell.md"): render_real_cell,
     PAGE.with_name("packer_results.md"): render_packer,
+    PAGE.with_name("replay.md"): render_replay,
 }
 """Every page of results, with the function that makes its text."""
 

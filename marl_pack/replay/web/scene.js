@@ -329,5 +329,7 @@ class View3D {
       else this.requestDraw();
     }
     this.renderer.render(this.scene, this.camera);
+    if (!this.drawn) performance.mark("first picture");
+    this.drawn = true;
   }
 }
