@@ -7,6 +7,7 @@ import hashlib
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,16 @@ def test_contacts_are_those_of_the_boxes() -> None:
     below, shares = contacts(Plan.of_boxes((8, 8, 8), boxes))
     assert below == [[], [], [0, 1], [2], [], [4]]
     assert shares.tolist() == [1, 1, 1, 1, 1, 0.5]
+
+
+def test_boxes_of_other_bins_carry_nothing() -> None:
+    first = Plan.of_boxes((8, 8, 8), [(0, 0, 0, 4, 4, 2), (0, 0, 2, 4, 4, 2)])
+    both = replace(
+        first, bin_sizes=np.array([[8, 8, 8], [8, 8, 8]]), bins=np.array([0, 1]),
+    )  # fmt: skip
+    below, shares = contacts(both)
+    assert below == [[], []]
+    assert shares.tolist() == [1, 0]
 
 
 def test_support_shares_of_the_plan_are_kept() -> None:
@@ -133,8 +144,6 @@ def test_plans_without_values_have_no_such_colours() -> None:
 
 
 def test_unknown_values_have_a_colour_of_their_own(plan: Plan) -> None:
-    from dataclasses import replace
-
     some = replace(plan, margins=np.where(np.arange(len(plan)) < 3, np.nan, 5.0))
     colouring = colour_plan(some, "margin")
     assert colouring is not None
@@ -154,6 +163,22 @@ def test_captions_move_and_the_bar_grows(plan: Plan) -> None:
     assert film.caption(11).startswith("two orders: box 11 of 11, bin 2 of 2, ")
     done = [int((film.frame(step)[-BAR // 2] == (11, 92, 173)).all(1).sum()) for step in (0, 4, 11)]
     assert done == [0, round(720 * 4 / 11), 720]
+
+
+def test_a_frame_shows_the_boxes_that_are_placed(plan: Plan) -> None:
+    film = Film(plan.in_bin(0))
+    assert len(film.plan) == 6
+    # The item beside the bin is the box that comes next, and nothing lies in the empty bin.
+    from marl_pack.render.picture import draw, drawable
+
+    whole = drawable(film.plan)
+    for step in (0, 3):
+        w, d, h = whole.boxes[step, 3:].tolist()
+        expected = draw(
+            whole.size, whole.boxes[:step], (w, d, h), title=film.caption(step),
+            pixels=(720, 480), leave_space=True, parts=whole.parts,
+        )  # fmt: skip
+        assert np.array_equal(film.frame(step)[:-BAR], expected[:-BAR])
 
 
 def test_films_show_every_box(plan: Plan, tmp_path: Path) -> None:

@@ -48,6 +48,12 @@ PLAN: dict[str, Any] = {
         {"id": "b", "bin": 0, "x": 2, "y": 0, "z": 0, "w": 5, "d": 5, "h": 5, "orientation": -1,
          "weight": 1.0, "centre_x": 4.5, "centre_y": 2.5},
     ],
+    "explanations": [
+        None,
+        {"legal": 3, "chosen": 1, "value_of": "score", "values": [0.5, None],
+         "probabilities": [None, 1.0], "orientation_probabilities": [0, 0, 0, 0.5, 0.25, 0.25],
+         "placements": {"orientation": [0, 3], "x": [2, 2], "y": [0, 1.5], "z": [0, 0]}},
+    ],
 }  # fmt: skip
 """A plan of two boxes as :meth:`marl_pack.plan.Plan.to_json` writes it."""
 
@@ -168,6 +174,18 @@ def bad_plans() -> Iterator[Case]:
     )  # fmt: skip
     for change in changes:
         yield f"bad plan {change}", json.dumps(PLAN | change).encode(), ".json"
+    for key, wrong in (
+        ("legal", (1, -1, "3", None, 1e300)), ("chosen", (2, -2, 0.5, None)),
+        ("values", ([1.0], "ab", [1, "a"], None)), ("probabilities", ([], [[1], [2]])),
+        ("orientation_probabilities", ([1], 6 * ["x"])), ("value_of", (3, None)),
+        ("placements", ({}, [], {"orientation": [6, 0], "x": [1, 1], "y": [1, 1], "z": [1, 1]})),
+        ("colour", (1,)),
+    ):  # fmt: skip
+        for value in wrong:
+            plan = json.loads(json.dumps(PLAN))
+            plan["explanations"][1][key] = value
+            yield f"bad explanation {key} {value!r}", json.dumps(plan).encode(), ".json"
+    yield "bad explanations", json.dumps(PLAN | {"explanations": [None]}).encode(), ".json"
     table = _as_csv(PLAN)
     for name, content in {
         "digits": table.replace(b"a,0,0,0", "a,0,0,٠".encode()), "Latin-1": table + b"\xe9",

@@ -113,8 +113,13 @@ def item_files(seed: int, folder: Path) -> Iterator[Case]:
 def plan_files(seed: int, folder: Path) -> Iterator[Case]:
     """Yield files of plans, as JSON, CSV and npz."""
     from marl_pack.plan_archive import load_plans
+    from marl_pack.replay.document import make_document
 
-    yield from _files(seed, folder, load_plans, plans=True)
+    def read(path: Path) -> None:
+        for plan in load_plans(path):
+            json.dumps(make_document(plan), allow_nan=False)
+
+    yield from _files(seed, folder, read, plans=True)
 
 
 def _files(seed: int, folder: Path, read: Callable[[Path], Any], plans: bool) -> Iterator[Case]:
