@@ -16,6 +16,7 @@ import marl_pack
 from marl_pack import Packer, Packing, Plan, evaluate, load, pack, play
 from marl_pack.agents.explaining import explain
 from marl_pack.agents.search_settings import SearchSettings
+from marl_pack.evaluation.rollout import Reasons
 from marl_pack.explanation import MOST_LISTED, Explanation
 from marl_pack.plan_archive import load_plans
 
@@ -186,6 +187,15 @@ def test_long_lists_keep_the_chosen_and_the_best() -> None:
     assert set(short.values.tolist()) == {7.0, *values[-MOST_LISTED + 1 :].tolist()}
     assert short.legal == count
     assert long.shortened(count) is long
+
+
+def test_an_item_that_is_placed_nowhere_has_no_explanation() -> None:
+    why = packed().plan.explanations[0]
+    reasons = Reasons(2)
+    reasons.add([why, why], [3, 2])  # game 0 began with 2 boxes, game 1 with one
+    reasons.add([why, None], [3, 2])  # nothing was placed
+    plans = [Plan.of_boxes((8, 8, 8), [(2 * k, 0, 0, 2, 2, 2) for k in range(n)]) for n in (3, 2)]
+    assert [plan.explanations for plan in reasons.of(plans)] == [(None, None, why), (None, why)]
 
 
 WRONG: dict[str, Any] = {
