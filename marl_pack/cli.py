@@ -20,6 +20,7 @@ COMMANDS = {
     "play": ("marl_pack.play", "play one game turn by turn, and draw the packed bin"),
     "export": ("marl_pack.export.command", "write trained agents as ONNX, or for rsl_rl"),
     "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
+    "serve": ("marl_pack.serve", "serve packers over HTTP: bins, placements, plans"),
     "tune": ("marl_pack.tune", "find the weights of the heuristic linear for your own goods"),
     "compile": ("marl_pack.compile", "compile all code now, so that no later start has to wait"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),

@@ -19,11 +19,12 @@ LAYERS = (
     ("game",),
     ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
     ("packer",),
+    ("service",),
     ("evaluation",),
     # The programs, and what only they use.
     ("cli", "compile", "config", "evaluate", "export", "feed", "integrations", "options", "pack",
      "physics", "play",
-     "players", "players_mm", "train", "training", "tune"),
+     "players", "players_mm", "serve", "train", "training", "tune"),
 )  # fmt: skip
 
 # What the judge and the environment must not need.
