@@ -39,7 +39,7 @@ PROGRAMS = {
         "real_goods", "real_cell", "packer")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
     **{name: f"benchmarks.{name}" for name in (
-        "masks", "rules", "room", "game", "training", "play", "exact")},
+        "masks", "rules", "room", "game", "training", "play", "exact", "service")},
 }  # fmt: skip
 """The program that makes each table."""
 

@@ -104,7 +104,7 @@ def _options() -> Any:
     return create_model("_Options", __base__=Model, **found)
 
 
-_Options = _options()
+_Options: Any = _options()
 
 
 class OpenBin(_Options):

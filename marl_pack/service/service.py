@@ -65,6 +65,7 @@ class Bin:
         self.row: BinRow | None = None
         self.packer: Packer | None = None
         self.step, self.closed = 0, False
+        self.keys: set[str] = set()  # idempotency keys that were used
 
 
 def dump(value: Any) -> str:
@@ -204,6 +205,7 @@ class Service:
         if bin.row is None:
             bin.row = self._row(bin.id)
             bin.step, bin.closed = bin.row.step, bin.row.closed
+            bin.keys = self.store.keys(bin.row.number)
         return bin.row
 
     def _restored(self, bin: Bin) -> Packer:
@@ -285,8 +287,8 @@ class Service:
         arguments = dict(body)
         with bin.changing:
             number = self._load(bin).number
-            if keyed is not None and (before := self.store.answered(number, keyed.key)):
-                return _again(keyed, before)
+            if keyed is not None and keyed.key in bin.keys:
+                return _again(keyed, self.store.answered(number, keyed.key))
             self._check(bin, arguments.pop("step", None), kind in ("place", "actual"))
             packer = self._restored(bin)
         if kind == "place":
@@ -310,6 +312,8 @@ class Service:
                     bin.packer = None  # memory must not know more than the file
                 raise
             bin.step = step
+            if keyed is not None:
+                bin.keys.add(keyed.key)
             if kind == "close":
                 bin.closed = True
                 with self._opening:

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,6 +84,16 @@ class Entry:
     keyed: Keyed | None = None
 
 
+@dataclass
+class _Write:
+    """A statement that waits for the disk."""
+
+    statement: str
+    values: tuple[Any, ...]
+    done: bool = False
+    error: sqlite3.Error | None = None
+
+
 class Store:
     """The file of the bins; every method may be called from any thread.
 
@@ -96,6 +107,7 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = threading.Lock()
+        self._waiting: deque[_Write] = deque()
         try:
             self._file = sqlite3.connect(
                 path, timeout=0, isolation_level=None, check_same_thread=False
@@ -152,18 +164,38 @@ class Store:
             except sqlite3.Error as error:
                 raise StoreError(f"the data cannot be read ({error})") from error
 
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """Yield the file in a transaction, which is on the disk at the end, or undone."""
+    def _write(self, statement: str, values: tuple[Any, ...]) -> None:
+        """Do a statement; it is on the disk on return.
+
+        Statements of several threads that wait for the disk share a transaction: the first thread
+        that gets the lock commits what all of them have brought.
+
+        Raises:
+            StoreError: if that fails; the file has not changed then.
+        """
+        mine = _Write(statement, values)
+        self._waiting.append(mine)
         with self._lock:
-            try:
-                self._file.execute("BEGIN IMMEDIATE")
-                yield self._file
-                self._file.execute("COMMIT")
-            except sqlite3.Error as error:
-                if self._file.in_transaction:
-                    self._file.execute("ROLLBACK")
-                raise StoreError(f"the data cannot be written ({error})") from error
+            if not mine.done:
+                batch = [self._waiting.popleft() for _ in range(len(self._waiting))]
+                error = self._commit(batch)
+                for write in batch:
+                    write.done, write.error = True, error
+        if mine.error is not None:
+            raise StoreError(f"the data cannot be written ({mine.error})") from mine.error
+
+    def _commit(self, batch: Sequence[_Write]) -> sqlite3.Error | None:
+        """Do statements in one transaction; return the error if it failed and was undone."""
+        try:
+            self._file.execute("BEGIN IMMEDIATE")
+            for write in batch:
+                self._file.execute(write.statement, write.values)
+            self._file.execute("COMMIT")
+        except sqlite3.Error as error:
+            if self._file.in_transaction:
+                self._file.execute("ROLLBACK")
+            return error
+        return None
 
     # --- bins -------------------------------------------------------------------------------------
 
@@ -172,11 +204,10 @@ class Store:
     ) -> None:
         """Add a bin, and the answer to the request that opened it."""
         key, digest = (None, None) if keyed is None else (keyed.key, keyed.digest)
-        with self._writing() as file:
-            file.execute(
-                "INSERT INTO bins (id, opened, arguments, answer, key, digest) "
-                "VALUES (?, ?, ?, ?, ?, ?)", (id, opened, arguments, answer, key, digest),
-            )  # fmt: skip
+        self._write(
+            "INSERT INTO bins (id, opened, arguments, answer, key, digest) "
+            "VALUES (?, ?, ?, ?, ?, ?)", (id, opened, arguments, answer, key, digest),
+        )  # fmt: skip
 
     def bin(self, id: str) -> BinRow | None:
         """Return a bin; None if there is none with this id."""
@@ -200,7 +231,10 @@ class Store:
                 "EXISTS (SELECT 1 FROM log WHERE bin = b.number AND kind = 'close') "
                 f"FROM bins b WHERE {condition} ORDER BY b.number LIMIT ?", (value, limit),
             ).fetchall()  # fmt: skip
-        return [BinRow(*row[:5], bool(row[5])) for row in rows]
+        return [
+            BinRow(number, name, opened, arguments, step, bool(closed))
+            for number, name, opened, arguments, step, closed in rows
+        ]
 
     def count_open(self) -> int:
         """Return the number of bins that are not closed."""
@@ -222,20 +256,25 @@ class Store:
     def add(self, bin: int, entry: Entry) -> None:
         """Add a request to the log of bin number ``bin``; it is on the disk on return."""
         key, digest = (None, None) if entry.keyed is None else (entry.keyed.key, entry.keyed.digest)
-        with self._writing() as file:
-            file.execute(
-                "INSERT INTO log (bin, step, kind, call, key, digest, answer) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (bin, entry.step, entry.kind, entry.call, key, digest, entry.answer),
-            )
+        self._write(
+            "INSERT INTO log (bin, step, kind, call, key, digest, answer) "
+            "VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (bin, entry.step, entry.kind, entry.call, key, digest, entry.answer),
+        )
 
-    def answered(self, bin: int, key: str) -> tuple[bytes, str] | None:
-        """Return digest and answer of the request to a bin with this key."""
+    def keys(self, bin: int) -> set[str]:
+        """Return the idempotency keys of the requests to a bin."""
+        with self._reading() as file:
+            rows = file.execute("SELECT key FROM log WHERE bin = ? AND key NOT NULL", (bin,))
+            return {key for (key,) in rows}
+
+    def answered(self, bin: int, key: str) -> tuple[bytes, str]:
+        """Return digest and answer of the request to a bin with one of its :meth:`keys`."""
         with self._reading() as file:
             row = file.execute(
                 "SELECT digest, answer FROM log WHERE bin = ? AND key = ?", (bin, key)
             ).fetchone()
-        return None if row is None else (row[0], row[1])
+        return row[0], row[1]
 
     def changes(self, bin: int) -> list[tuple[str, str | None]]:
         """Return kind and call of every request that changed a bin, in order."""
