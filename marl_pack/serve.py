@@ -133,9 +133,9 @@ def run(chosen: argparse.Namespace) -> None:
 
     store = Store(chosen.data)
     service = Service(store, limits, chosen.policy)
+    listening = listen(chosen.host, chosen.port)
     for policy in ("max_contact", "linear", "search"):
         warm_up({"policy": policy})
-    listening = listen(chosen.host, chosen.port)
     host = f"[{chosen.host}]" if ":" in chosen.host else chosen.host
     address = f"http://{host}:{listening.getsockname()[1]}"
 

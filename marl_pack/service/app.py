@@ -56,7 +56,7 @@ def _errors(*codes: str) -> dict[int | str, dict[str, Any]]:
     return found
 
 
-READS = _errors("unknown_bin")
+READS = _errors("unknown_bin", "impossible")
 CHANGES = _errors(
     "not_json", "unknown_bin", "closed", "wrong_step", "too_many_steps", "impossible", "key_reused",
     "storage",

@@ -240,7 +240,7 @@ class State(Listed):
                 {
                     "id": "pallet-7", "opened": "2026-01-31T08:15:00+00:00", "closed": False,
                     "policy": "max_contact", "boxes": 2, "utilization": 0.083, "weight": 16.4,
-                    "least_margin": None, "step": 2,
+                    "least_margin": 24.5, "step": 2,
                 }
             ]
         }

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +45,18 @@ class Policies:
             ``marl-pack tune``, runs, checkpoints, or FILE.py:NAME. Clients name them as they are
             written here.
         max_budget_ms: largest time budget of a search.
+
+    Raises:
+        ValueError, FileNotFoundError: if one of the others cannot be loaded.
     """
 
     def __init__(self, others: Sequence[str], max_budget_ms: float) -> None:
-        self.names = (*PACKER_POLICIES, *published.models(), *others)
+        self.names = tuple(dict.fromkeys((*PACKER_POLICIES, *published.models(), *others)))
         self.max_budget_ms = max_budget_ms
-        self._shared: dict[Any, PackerPolicy] = {}  # those that take long to load
+        # Those that take long to load, as long as a bin uses them.
+        self._shared: WeakValueDictionary[Any, _OneAtATime] = WeakValueDictionary()
         self._lock = threading.Lock()
+        self._loaded = [self.make(name, ExactSpec(), None, None, 0) for name in others]
 
     def make(
         self, name: str, spec: ExactSpec, plan: str | None, grid_mm: float | None, seed: int
@@ -78,7 +84,8 @@ class Policies:
             return make_packer_policy(name, spec, plan=plan, grid_mm=grid_mm, seed=seed)
         key = (name, spec, grid_mm, seed)
         with self._lock:
-            if key not in self._shared:
+            shared = self._shared.get(key)
+            if shared is None:
                 policy = make_packer_policy(name, spec, grid_mm=grid_mm, seed=seed)
-                self._shared[key] = _OneAtATime(policy, threading.Lock())
-            return self._shared[key]
+                shared = self._shared[key] = _OneAtATime(policy, threading.Lock())
+            return shared

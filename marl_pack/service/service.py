@@ -35,7 +35,9 @@ from marl_pack.service.store import BinRow, Entry, Keyed, Store
 
 T = TypeVar("T")
 THREADS = 64
-"""Bins that may work at once."""
+"""Bins that may change at once."""
+READERS = 4
+"""Bins that may be read at once, also while all threads above are busy."""
 OPTIONS = tuple(each.name for each in options_of(ExactSpec))
 
 
@@ -99,10 +101,12 @@ class Service:
         self._open = store.count_open()
         self._opening = threading.Lock()
         self._pool = ThreadPoolExecutor(THREADS, "bin")
+        self._readers = ThreadPoolExecutor(READERS, "reader")
 
     def close(self) -> None:
         """Finish what is being done, and close the file."""
         self._pool.shutdown()
+        self._readers.shutdown()
         self.store.close()
 
     async def _run(self, work: Callable[..., T], *arguments: Any) -> T:
@@ -240,7 +244,7 @@ class Service:
             with bin.changing:
                 return work(bin, self._restored(bin))
 
-        result = await self._run(reading)
+        result = await asyncio.get_running_loop().run_in_executor(self._readers, reading)
         self._keep(bin)
         return result
 
@@ -295,30 +299,35 @@ class Service:
             with checking_values():
                 packer.offer(**arguments)  # the policy decides, while others may read the bin
         with bin.changing:
-            before_calls = len(packer.calls)
-            try:
-                with checking_values():
-                    answer, changed = CHANGES[kind](packer, arguments)
-                step = bin.step + changed
-                call = None
-                if len(packer.calls) > before_calls:
-                    call = dump(calls.to_row(packer.calls[-1]))
-                text = dump({**answer, "step": step})
-                if changed or keyed is not None:
-                    number_of_change = step if changed else None
-                    self.store.add(number, Entry(kind, text, number_of_change, call, keyed))
-            except BaseException:
-                if len(packer.calls) != before_calls:
-                    bin.packer = None  # memory must not know more than the file
-                raise
-            bin.step = step
-            if keyed is not None:
-                bin.keys.add(keyed.key)
-            if kind == "close":
-                bin.closed = True
-                with self._opening:
-                    self._open -= 1
-            return Answer(text)
+            return self._commit(bin, packer, kind, arguments, keyed)
+
+    def _commit(
+        self, bin: Bin, packer: Packer, kind: str, arguments: dict[str, Any], keyed: Keyed | None
+    ) -> Answer:
+        """Change a bin and write it to the file, or do neither; ``changing`` is held."""
+        row, count = self._load(bin), len(packer.calls)
+        try:
+            with checking_values():
+                answer, changed = CHANGES[kind](packer, arguments)
+            step = bin.step + changed
+            made = len(packer.calls) > count
+            call = dump(calls.to_row(packer.calls[-1])) if made else None
+            text = dump({**answer, "step": step})
+            if changed or keyed is not None:
+                entry = Entry(kind, text, step if changed else None, call, keyed)
+                self.store.add(row.number, entry)
+        except BaseException:
+            if len(packer.calls) != count:  # memory must not know more than the file
+                bin.row = bin.packer = None
+            raise
+        bin.step = step
+        if keyed is not None:
+            bin.keys.add(keyed.key)
+        if kind == "close":
+            bin.closed = True
+            with self._opening:
+                self._open -= 1
+        return Answer(text)
 
     def _check(self, bin: Bin, step: int | None, grows: bool = False) -> None:
         """Refuse a change of a bin that is closed, is full of changes, or has another step.

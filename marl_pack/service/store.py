@@ -49,7 +49,7 @@ CREATE INDEX closed ON log (bin) WHERE kind = 'close';
 """
 
 
-class StoreError(Exception):
+class StoreError(OSError):
     """The file cannot be read or written; nothing was changed."""
 
 
