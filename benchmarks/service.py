@@ -4,8 +4,8 @@ The server runs as a process of its own, on the loopback address, with a file on
 client has a bin of its own and places cartons of mixed sizes, drawn at random; when a box has no
 place, it closes the bin and opens the next one. In a closed loop a client sends the next box when
 it has the answer; paced, it sends one box a second. Clients and server share the machine's cores.
-Times are those that the client waits, in milliseconds. The last rows are the memory of the whole
-server, in MiB.
+Then a client reads a bin while 8 others search, for 500 ms a box. Times are those that the client
+waits, in milliseconds. The last row is the memory of the whole server, in MiB.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.exact import CARTONS
 from benchmarks.record import Measurements
@@ -44,7 +45,7 @@ class Client:
         self.reader, self.writer = await asyncio.open_connection("127.0.0.1", self.port)
         return self
 
-    async def post(self, path: str, body: Any) -> Any:
+    async def post(self, path: str, body: Any, method: str = "POST") -> Any:
         """Send JSON and return the answer's JSON.
 
         Raises:
@@ -52,7 +53,7 @@ class Client:
         """
         content = json.dumps(body).encode()
         self.writer.write(
-            f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+            f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             f"Content-Length: {len(content)}\r\n\r\n".encode()
             + content
         )
@@ -63,17 +64,20 @@ class Client:
             raise ValueError(f"{path}: {answer}")
         return answer
 
-    async def open(self) -> str:
+    async def open(self, **arguments: Any) -> str:
         """Open a bin and return its path."""
-        bin = await self.post("/bins", {"margin_mm": MARGIN_MM})
+        bin = await self.post("/bins", {"margin_mm": MARGIN_MM, **arguments})
         return f"/bins/{bin['id']}"
 
 
-async def place_boxes(port: int, number: int, seconds: float, pause: float) -> list[float]:
+async def place_boxes(
+    port: int, number: int, seconds: float, pause: float, **arguments: Any
+) -> list[float]:
     """Place boxes for some time as one client; return the seconds that each answer took."""
     generator = np.random.default_rng((SEED, number))
     client = await Client(port).connect()
-    path, times = await client.open(), []
+    times: list[float] = []
+    path = await client.open(**arguments)
     await asyncio.sleep(pause * generator.random())
     end = due = time.perf_counter()
     end += seconds
@@ -84,7 +88,7 @@ async def place_boxes(port: int, number: int, seconds: float, pause: float) -> l
         times.append(time.perf_counter() - start)
         if not answer["placed"]:
             await client.post(f"{path}/close", {})
-            path = await client.open()
+            path = await client.open(**arguments)
         due = max(due + pause, time.perf_counter()) if pause else time.perf_counter()
         await asyncio.sleep(max(0.0, due - time.perf_counter()))
     return times
@@ -94,8 +98,37 @@ async def load(port: int, clients: int, seconds: float, pause: float) -> dict[st
     """Return the figures of several clients at once."""
     start = time.perf_counter()
     work = [place_boxes(port, number, seconds, pause) for number in range(clients)]
-    times = np.concatenate(await asyncio.gather(*work)) * 1000
-    took = time.perf_counter() - start
+    times = np.concatenate(await asyncio.gather(*work))
+    return figures_of(times, time.perf_counter() - start)
+
+
+async def read_bin(port: int, seconds: float) -> list[float]:
+    """Read the state of a bin for some time; return the seconds that each answer took."""
+    client = await Client(port).connect()
+    times: list[float] = []
+    path = await client.open()
+    end = time.perf_counter() + seconds
+    while (start := time.perf_counter()) < end:
+        await client.post(path, {}, "GET")
+        times.append(time.perf_counter() - start)
+        await asyncio.sleep(0.02)
+    return times
+
+
+async def searches(port: int, clients: int, seconds: float) -> dict[str, float]:
+    """Return the figures of one client that reads while others place by search."""
+    start = time.perf_counter()
+    work = [
+        place_boxes(port, number, seconds, 0, policy="search", plan="budget=500ms")
+        for number in range(clients)
+    ]
+    times, *_ = await asyncio.gather(read_bin(port, seconds), *work)
+    return figures_of(np.array(times), time.perf_counter() - start)
+
+
+def figures_of(times: NDArray[np.float64], took: float) -> dict[str, float]:
+    """Return the figures of answers that took so many seconds, and all together ``took``."""
+    times = times * 1000
     p50, p95, p99 = np.percentile(times, (50, 95, 99)).tolist()
     return {
         "ms_p50": p50, "ms_p95": p95, "ms_p99": p99, "ms_max": float(times.max()),
@@ -147,7 +180,10 @@ def main() -> None:
                 for clients in CLIENTS:
                     pause = 0.0 if kind == "closed loop" else 1.0
                     figures = asyncio.run(load(port, clients, seconds, pause))
-                    measured.keep(f"{kind}, {clients} clients", **figures)
+                    name = f"{kind}, {clients} client{'s' if clients > 1 else ''}"
+                    measured.keep(name, clients=clients, **figures)
+            figures = asyncio.run(searches(port, 8, SECONDS["closed loop"]))
+            measured.keep("reading a bin while 8 others search", clients=9, **figures)
         finally:
             process.terminate()
             process.wait()

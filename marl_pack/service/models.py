@@ -40,6 +40,7 @@ Step = Annotated[
 ]
 Text = Annotated[str, Described(max_length=LONGEST_TEXT)]
 Number = Annotated[int, Described(ge=-(2**63), lt=2**63)]
+Coordinate = Annotated[float, Described(ge=-1e9, le=1e9)]
 AsTuple = Described(strict=False)  # a JSON list stands for a tuple; the values in it stay strict
 
 
@@ -77,8 +78,8 @@ class Box(Change):
 class Actual(Change):
     """Where the robot really put the box that was placed last."""
 
-    x: Annotated[float, Described(description="Middle of the box in the bin, in millimetres.")]
-    y: float
+    x: Annotated[Coordinate, Described(description="Middle of the box in the bin, millimetres.")]
+    y: Coordinate
     yaw: Annotated[
         float, Described(description="Rotation in degrees, counterclockwise seen from above.")
     ] = 0.0
