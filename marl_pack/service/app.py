@@ -215,8 +215,11 @@ def make_app(service: Service, token: str | None = None) -> App:
 
     @app.exception_handler(HTTPException)
     def refused(_: Request, error: HTTPException) -> Response:
-        code = error.code if isinstance(error, Refusal) else code_of(error.status_code)
-        return answer(error.status_code, code, str(error.detail), error.headers)
+        if isinstance(error, Refusal):
+            return answer(error.status_code, error.code, error.detail, error.headers)
+        code = code_of(error.status_code)
+        meaning = CODES[code][1] if code in CODES else str(error.detail)
+        return answer(error.status_code, code, meaning, error.headers)
 
     @app.exception_handler(RequestValidationError)
     def invalid(_: Request, error: RequestValidationError) -> Response:

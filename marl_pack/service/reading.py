@@ -10,7 +10,7 @@ from fastapi import Request, Response
 from fastapi.routing import APIRoute
 
 from marl_pack import renamed
-from marl_pack.checks import one_line, shown
+from marl_pack.checks import LONGEST_TEXT, one_line, shown
 from marl_pack.inputs import unique_keys
 from marl_pack.service.refusals import Refusal
 
@@ -72,11 +72,20 @@ def describe(errors: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
         names: the keys of the body that are valid.
     """
     first = errors[0]
-    where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
+    _, *path = first["loc"]  # after body, query, path or header
+    # A union adds the names of its types, which mean nothing to a client.
+    where = ".".join(str(part) for k, part in enumerate(path) if k == 0 or isinstance(part, int))
     if first["type"] == EXTRA:
-        return f"unknown key {shown(where[-1])}{renamed.guess(where[-1], names) or ''}"
-    message = first["msg"][:1].lower() + first["msg"][1:]
+        return f"unknown key {shown(where)}{renamed.guess(where, names)}"
     if first["type"] == "missing":
-        return f"{'.'.join(where) or 'body'}: is missing"
-    value = "" if first.get("input") is None else f", not {shown(first['input'])}"
-    return f"{'.'.join(where) or 'body'}: {message}{value}"
+        return f"{where or 'body'}: is missing"
+    message = first["msg"][:1].lower() + first["msg"][1:]
+    return f"{where or 'body'}: {message}, not {_as_json(first.get('input'))}"
+
+
+def _as_json(value: Any) -> str:
+    """Return a value for a message as the client wrote it."""
+    try:
+        return one_line(json.dumps(value, ensure_ascii=False), LONGEST_TEXT)
+    except ValueError:  # an int of more digits than Python writes
+        return shown(value)

@@ -59,7 +59,8 @@ def checking_values() -> Iterator[None]:
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
-        raise Refusal("impossible", str(error)) from error
+        message = str(error).replace("box: row 0", "the box")  # the only one of the request
+        raise Refusal("impossible", message) from error
 
 
 def document(code: str, message: str) -> dict[str, Any]:
