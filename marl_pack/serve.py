@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 PROGRAM = "python -m marl_pack.serve"
 LOOPBACK = "127.0.0.1"
 BACKLOG = 2048
+KEEP_ALIVE_S = 75
+"""Seconds without a request after which a connection is closed; boxes come seconds apart."""
 NOTE = """\
 The API is described at /docs, and in docs/service.md. Anyone who reaches the address may use the
 service: without --token-file it serves this machine only."""
@@ -147,6 +149,7 @@ def run(chosen: argparse.Namespace) -> None:
     config = uvicorn.Config(
         make_app(service, token), log_level="info" if chosen.access_log else "warning",
         access_log=chosen.access_log, server_header=False, proxy_headers=False, lifespan="on",
+        timeout_keep_alive=KEEP_ALIVE_S,
     )  # fmt: skip
     Server(config).run(sockets=[listening])
 

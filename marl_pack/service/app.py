@@ -11,10 +11,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, FastAPI, Header, Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi_offline import FastAPIOffline
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 import marl_pack
 from marl_pack.packer.packer import Packer
+from marl_pack.plan import Plan
 from marl_pack.service import models
 from marl_pack.service.guard import App, Guard
 from marl_pack.service.limits import LONGEST_KEY
@@ -42,8 +44,9 @@ Key = Annotated[
 PAGE = {
     "content-security-policy": "default-src 'self' 'unsafe-inline' data: blob:",
     "x-content-type-options": "nosniff",
+    "cache-control": "no-store",
 }
-"""Headers of a page: it loads nothing from elsewhere."""
+"""Headers of a page: it loads nothing from elsewhere, and is always new."""
 
 
 def _errors(*codes: str) -> dict[int | str, dict[str, Any]]:
@@ -146,8 +149,15 @@ def make_router(service: Service) -> APIRouter:
         response_model=dict[str, Any], responses=READS,
     )  # fmt: skip
     async def read_plan(id: BinId) -> Any:
-        text = await service.read(id, lambda _, packer: dump(packer.plan.to_dict()))
+        plan = await service.read(id, _plan)
+        text = await run_in_threadpool(lambda: dump(plan.to_dict()))
         return Response(text, media_type="application/json")
+
+    async def replay_of(id: str) -> dict[str, Any]:
+        """Return the content of the replay page; the bin may change meanwhile."""
+        from marl_pack.replay.document import make_document
+
+        return await run_in_threadpool(make_document, await service.read(id, _plan), title=id)
 
     @router.get(
         "/bins/{id}/replay", tags=["results"], summary="A page that shows the bin being packed",
@@ -156,9 +166,7 @@ def make_router(service: Service) -> APIRouter:
     async def replay(id: BinId) -> Any:
         from marl_pack.replay.page import make_page
 
-        page = await service.read(
-            id, lambda bin, packer: make_page(_replay(bin, packer), live="replay.json")
-        )
+        page = make_page(await replay_of(id), live="replay.json")
         return Response(page, 200, PAGE, "text/html; charset=utf-8")
 
     @router.get(
@@ -166,8 +174,8 @@ def make_router(service: Service) -> APIRouter:
         response_model=dict[str, Any], responses=READS,
     )  # fmt: skip
     async def replay_json(id: BinId) -> Any:
-        text = await service.read(id, lambda bin, packer: dump(_replay(bin, packer)))
-        return Response(text, media_type="application/json")
+        text = dump(await replay_of(id))
+        return Response(text, headers={"cache-control": "no-store"}, media_type="application/json")
 
     return router
 
@@ -183,12 +191,8 @@ def _state(bin: Bin, packer: Packer) -> str:
     })  # fmt: skip
 
 
-def _replay(bin: Bin, packer: Packer) -> dict[str, Any]:
-    """Return the document of the replay page of a bin."""
-    from marl_pack.replay.document import make_document
-
-    document: dict[str, Any] = make_document(packer.plan, title=bin.id)
-    return document
+def _plan(_: Bin, packer: Packer) -> Plan:
+    return packer.plan
 
 
 def make_app(service: Service, token: str | None = None) -> App:
