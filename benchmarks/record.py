@@ -26,7 +26,10 @@ from marl_pack.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
-PACKAGES = ("torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless")
+PACKAGES = (
+    "torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless", "fastapi",
+    "uvicorn",
+)  # fmt: skip
 MEASURED = ("marl_pack", "models/*.pt", "configs")
 """The files that figures depend on, besides the code of the commands."""
 PROGRAMS = {

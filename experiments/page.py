@@ -211,7 +211,7 @@ def render_service(folder: Path = RESULTS) -> str:
     return template("service").render(
         loads=sorted(rows.items(), key=lambda row: (row[0].split(",")[0], row[1]["clients"])),
         memory=memory, cores=memory["record"]["cores"], made=lambda name: made(tables[name]),
-        limits=options_of(ServiceLimits), codes=list(CODES.items()),
+        limits=options_of(ServiceLimits), codes=sorted(CODES.items(), key=lambda code: code[1][0]),
     )  # fmt: skip
 
 
