@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -663,6 +665,18 @@ def test_a_killed_server_has_forgotten_nothing(tmp_path: Path) -> None:
     assert report["kills"] == 3
     for plan in report["plans"]:
         check_plan(plan, 0.1, 0.0)
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="the session needs curl")
+def test_the_session_of_the_page_runs_as_it_is_printed(tmp_path: Path) -> None:
+    page = (Path(__file__).parent.parent / "docs/service.md").read_text("utf-8")
+    session = re.findall(r"^\$ (curl .*)\n(.*)$", page, re.MULTILINE)
+    assert len(session) == 4
+    with serving(["--data", str(tmp_path / "a.sqlite")]) as (_, address):
+        for command, printed in session:
+            words = shlex.split(command.replace("localhost:8000", address))
+            result = subprocess.run(words, capture_output=True, text=True, timeout=60)
+            assert json.loads(result.stdout) == json.loads(printed)
 
 
 def test_the_example_of_a_robot_cell_runs(tmp_path: Path) -> None:

@@ -8,8 +8,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Annotated, Any
 
-from fastapi import APIRouter, FastAPI, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.security import HTTPBearer
 from fastapi_offline import FastAPIOffline
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -212,7 +213,9 @@ def make_app(service: Service, token: str | None = None) -> App:
         redoc_url=None, title="marl_pack", version=marl_pack.__version__, description=DESCRIPTION,
         lifespan=lifespan,
     )  # fmt: skip
-    app.include_router(make_router(service))
+    # The guard checks the token; this only describes it.
+    described = [] if token is None else [Depends(HTTPBearer(auto_error=False))]
+    app.include_router(make_router(service), dependencies=described)
 
     def answer(status: int, code: str, message: str, headers: Any = None) -> Response:
         return Response(dump(document(code, message)), status, headers, "application/json")
