@@ -72,6 +72,7 @@ benchmark: $(STAMP)  ## measure every figure on speed in the pages of results
 	$(BIN)/python -m benchmarks.training
 	$(BIN)/python -m benchmarks.play
 	$(BIN)/python -m benchmarks.exact
+	$(BIN)/python -m benchmarks.service
 
 results: $(STAMP)  ## make the pages of results of the figures in results/
 	$(BIN)/python -m experiments.page

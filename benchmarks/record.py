@@ -26,7 +26,10 @@ from marl_pack.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
-PACKAGES = ("torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless")
+PACKAGES = (
+    "torch", "rsl-rl-lib", "numpy", "numba", "scipy", "sapien", "opencv-python-headless", "fastapi",
+    "uvicorn",
+)  # fmt: skip
 MEASURED = ("marl_pack", "models/*.pt", "configs")
 """The files that figures depend on, besides the code of the commands."""
 PROGRAMS = {
@@ -39,7 +42,7 @@ PROGRAMS = {
         "real_goods", "real_cell", "packer")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
     **{name: f"benchmarks.{name}" for name in (
-        "masks", "rules", "room", "game", "training", "play", "exact", "page")},
+        "masks", "rules", "room", "game", "training", "play", "exact", "page", "service")},
 }  # fmt: skip
 """The program that makes each table."""
 

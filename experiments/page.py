@@ -24,7 +24,10 @@ from docs.pages import table as markdown_table
 from experiments import ablations, packer, packing, physics, planning, real_cell, real_goods
 from experiments.rows import main_of, mean
 from marl_pack.files import write_atomically
+from marl_pack.option_record import options_of
 from marl_pack.physics import table1
+from marl_pack.service.limits import ServiceLimits
+from marl_pack.service.refusals import CODES
 from marl_pack.stability import RULES
 
 PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
@@ -215,12 +218,25 @@ def render_replay(folder: Path = RESULTS) -> str:
     return between(page, "opening", text)
 
 
+def render_service(folder: Path = RESULTS) -> str:
+    """Return the text of docs/service.md; the arguments are those of :func:`render`."""
+    tables = tables_in(folder)
+    rows = tables["service"].rows()
+    memory = rows.pop("memory")
+    return template("service").render(
+        loads=sorted(rows.items(), key=lambda row: (row[0].split(",")[0], row[1]["clients"])),
+        memory=memory, cores=memory["record"]["cores"], made=lambda name: made(tables[name]),
+        limits=options_of(ServiceLimits), codes=sorted(CODES.items(), key=lambda code: code[1][0]),
+    )  # fmt: skip
+
+
 PAGES = {
     PAGE: render,
     PAGE.with_name("real_goods.md"): render_real_goods,
     PAGE.with_name("real_cell.md"): render_real_cell,
     PAGE.with_name("packer_results.md"): render_packer,
     PAGE.with_name("replay.md"): render_replay,
+    PAGE.with_name("service.md"): render_service,
 }
 """Every page of results, with the function that makes its text."""
 

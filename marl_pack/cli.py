@@ -22,6 +22,7 @@ COMMANDS = {
     "pack": ("marl_pack.pack", "pack boxes in millimetres, from a file or a conveyor"),
     "replay": ("marl_pack.replay.command", "show how a plan was packed: page, picture or film"),
     "demo": ("marl_pack.demo", "pack a pallet of cases, and look at it in the browser"),
+    "serve": ("marl_pack.serve", "serve packers over HTTP: bins, placements, plans"),
     "tune": ("marl_pack.tune", "find the weights of the heuristic linear for your own goods"),
     "compile": ("marl_pack.compile", "compile all code now, so that no later start has to wait"),
     "judge": ("marl_pack.physics.command", "build stacks in physics and see what falls; films"),

@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.table import Table
 
 from marl_pack.agents.sources import is_own
-from marl_pack.exact.lengths import to_mm
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.exact.streams import read_orders
 from marl_pack.files import Growing
@@ -22,11 +21,10 @@ from marl_pack.items.generated import no_such_file
 from marl_pack.option_record import given_options
 from marl_pack.options import NEXT_BIN, STOP
 from marl_pack.packer.answers import NoPlace, Placement
-from marl_pack.packer.calls import goods_of
 from marl_pack.packer.conveyor import Arrival, Refused, of_line, of_orders
 from marl_pack.packer.packed import Packed
 from marl_pack.packer.packer import Packer
-from marl_pack.packer.reasons import why_not
+from marl_pack.packer.warming import warm_up
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import save_plan
 from marl_pack.terminal import make_progress
@@ -67,7 +65,7 @@ class Feed:
             self.packer = saved
         self.times: list[float] = []  # seconds of each answer
         self.stopped = False
-        _warm_up(arguments)
+        warm_up(arguments)
 
     def step(self, arrival: Arrival) -> Placement | NoPlace:
         """Place a box, or do what the options ask for if it has no place."""
@@ -80,17 +78,6 @@ class Feed:
                 self.packer.skip(arrival.sides, **box)
         self.times.append(time.perf_counter() - start)
         return answer
-
-
-def _warm_up(arguments: dict[str, Any]) -> None:
-    """Run all code once, so that the first box does not wait while it is compiled or loaded."""
-    plan = {"plan": "budget=1ms"} if arguments["plan"] or arguments["policy"] == "search" else {}
-    packer = Packer(**{**arguments, **plan})
-    side = float(to_mm(max(1, min(packer.spec.size) // 3), packer.spec.unit_mm))
-    for _ in range(3):
-        packer.place((side, side, side), weight=1.0)
-    why_not(packer.bin, goods_of((side, side, side), {}, packer.spec))
-    packer.state, packer.plan  # noqa: B018  # read for what they compile
 
 
 def pack_file(feed: Feed, console: Console) -> None:

@@ -13,6 +13,7 @@ from fuzz.program import (
     games,
     millimetres,
     packers,
+    service,
 )
 
 
@@ -37,6 +38,12 @@ def test_random_games_in_millimetres_pass_plain_checks(tmp_path: Path) -> None:
 
 def test_random_calls_of_packers_pass_plain_checks(tmp_path: Path) -> None:
     for name, case in islice(packers(seed=4, folder=tmp_path), 10):
+        outcome, detail = attempt(case)
+        assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
+
+
+def test_random_requests_to_the_service_are_answered_right(tmp_path: Path) -> None:
+    for name, case in islice(service(seed=6, folder=tmp_path), 10):
         outcome, detail = attempt(case)
         assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
 

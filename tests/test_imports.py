@@ -19,11 +19,11 @@ LAYERS = (
     ("game",),
     ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
     ("packer", "replay"),
+    ("service",),
     ("evaluation",),
     # The programs, and what only they use.
     ("cli", "compile", "config", "demo", "evaluate", "export", "feed", "integrations", "options",
-     "pack", "physics", "play",
-     "players", "players_mm", "train", "training", "tune"),
+     "pack", "physics", "play", "players", "players_mm", "serve", "train", "training", "tune"),
 )  # fmt: skip
 
 # What the judge and the environment must not need.

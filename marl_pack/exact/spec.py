@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -205,7 +206,7 @@ class ExactSpec(OptionRecord):
         if self.thresholds is not None and RULES[self.rule] != AREA_RATIO:
             raise ValueError(f"thresholds: only the rule area_ratio has them, not {self.rule}")
 
-    @property
+    @cached_property
     def size(self) -> tuple[int, int, int]:
         """Sides W, D, H of the bin in units."""
         units, _ = to_units(self.bin_mm, self.unit_mm)
@@ -213,6 +214,10 @@ class ExactSpec(OptionRecord):
 
     def limits(self) -> Limits:
         """Return the options that compiled code reads, in whole numbers."""
+        return self._limits
+
+    @cached_property
+    def _limits(self) -> Limits:
         lattice = SCALE * in_units(self.margin_mm, self.unit_mm)
         thresholds = check_thresholds("paper" if self.thresholds is None else self.thresholds)
         return Limits(

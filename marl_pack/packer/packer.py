@@ -68,6 +68,7 @@ class Packer:
     Attributes:
         spec: the options of the bins and of the rule.
         placements: the placements so far, in order.
+        calls: the calls that changed it, in order (:mod:`marl_pack.packer.calls`).
         left_out: the boxes that were skipped, with the reasons.
 
     Args:
@@ -244,7 +245,26 @@ class Packer:
         """
         if not self.calls:
             raise ValueError("undo: nothing was done yet")
-        self._replay(self.calls[:-1])
+        self.replay(self.calls[:-1])
+
+    def replay(self, done: Sequence[Call]) -> None:
+        """Begin again and do calls, each of which is checked; if that fails, nothing changes.
+
+        Args:
+            done: calls that a packer with the same arguments recorded (:attr:`calls`).
+
+        Raises:
+            ValueError: if a call is impossible.
+        """
+        before = dict(vars(self))
+        try:
+            self._begin()
+            for call in done:
+                self._apply(call)
+            self.calls = list(done)
+        except ValueError:
+            vars(self).update(before)
+            raise
 
     # --- what was done ----------------------------------------------------------------------------
 
@@ -323,7 +343,7 @@ class Packer:
         try:
             made, rows = calls.read(content)
             packer = cls(**calls.complete(made, arguments))
-            packer._replay([calls.of_row(row, packer.spec) for row in rows])
+            packer.replay([calls.of_row(row, packer.spec) for row in rows])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return packer
@@ -335,18 +355,6 @@ class Packer:
         self._apply(call)
         self._offered = None
         self.calls.append(call)
-
-    def _replay(self, done: list[Call]) -> None:
-        """Begin again and do calls; if one is impossible, nothing changes."""
-        before = dict(vars(self))
-        try:
-            self._begin()
-            for call in done:
-                self._apply(call)
-            self.calls = done
-        except ValueError:
-            vars(self).update(before)
-            raise
 
     def _apply(self, call: Call) -> None:
         """Change the bins by a call.

@@ -98,6 +98,14 @@ def packers(seed: int, folder: Path) -> Iterator[Case]:
         yield name, lambda case=case: _done(case())
 
 
+def service(seed: int, folder: Path) -> Iterator[Case]:
+    """Yield sessions with the service: random requests, checked by what they answered."""
+    from .service import cases
+
+    for name, case in cases(seed):
+        yield name, lambda case=case: _done(case())
+
+
 def item_files(seed: int, folder: Path) -> Iterator[Case]:
     """Yield files of items, and play the first turn with those that are taken."""
     from marl_pack.game.packing import Packing
@@ -183,7 +191,7 @@ SOURCES: dict[str, Callable[[int, Path], Iterator[Case]]] = {
     source.__name__: source
     for source in (
         arguments, settings, item_files, plan_files, checkpoints, games, millimetres, packers,
-        hull_rules, equilibria,
+        service, hull_rules, equilibria,
     )
 }  # fmt: skip
 

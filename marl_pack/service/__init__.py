@@ -1,0 +1,1 @@
+"""The service: open bins, place boxes in them and fetch their plans over HTTP."""
