@@ -592,13 +592,32 @@ def test_the_description_is_complete_and_needs_no_network(client: TestClient) ->
 
 
 def test_the_replay_page_shows_the_bin(client: TestClient) -> None:
-    pytest.importorskip("marl_pack.replay.page")
     done(client.post("/bins", json={"id": "a"}), 201)
-    done(client.post("/bins/a/place", json={"sides": [400, 300, 250], "id": "first"}))
+    done(client.post("/bins/a/place", json={"sides": CARTONS[0], "id": "first"}))
     page = client.get("/bins/a/replay")
     assert page.headers["content-type"] == "text/html; charset=utf-8"
-    assert "replay.json" in page.text
-    assert "first" in client.get("/bins/a/replay.json").text
+    assert 'data-live="replay.json"' in page.text
+    shown = done(client.get("/bins/a/replay.json"))
+    assert shown["title"] == "a"
+    assert [box["id"] for box in shown["boxes"]] == ["first"]
+
+
+@pytest.mark.parametrize("policy", ["max_contact", "rs"])
+def test_a_bin_can_say_why_its_boxes_are_where_they_are(tmp_path: Path, policy: str) -> None:
+    for k in range(2):  # the second time the bins are made again from the file
+        with client_of(tmp_path / "bins.sqlite") as client:
+            for id, explain in (("why", True), ("plain", False)):
+                if k == 0:
+                    opened = {"id": id, "policy": policy, "explain": explain}
+                    done(client.post("/bins", json=opened), 201)
+                for sides in CARTONS[:3]:
+                    done(client.post(f"/bins/{id}/place", json={"sides": sides}))
+            plan = Plan.of_dict(done(client.get("/bins/why/plan")), "why")
+            assert len(plan.explanations) == 3 * (k + 1)
+            for why, position in zip(plan.explanations, plan.positions, strict=True):
+                assert why is not None
+                assert why.positions[why.chosen].tolist() == position.tolist()
+            assert "explanations" not in done(client.get("/bins/plain/plan"))
 
 
 def test_an_error_in_the_service_says_nothing_of_the_code(

@@ -129,6 +129,9 @@ class OpenBin(_Options):
         int,
         Described(ge=0, le=LARGEST_SEED, description="Seed of the policies random and search."),
     ] = 0
+    explain: Annotated[
+        bool, Described(description="Whether the plan says why each box is where it is.")
+    ] = False
     present: Annotated[
         dict[str, Any] | None,
         Described(description="A plan of one bin: boxes that are in it already."),

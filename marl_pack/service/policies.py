@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from marl_pack import published, renamed
 from marl_pack.checks import shown
+from marl_pack.exact.explaining import Explained, Reasons
 from marl_pack.exact.search_settings import ExactSearchSettings
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.packer.policies import (
@@ -35,6 +36,17 @@ class _OneAtATime:
         """Return the move of the visible box, int64 [1]."""
         with self.lock:
             return self.policy(turn)
+
+    def reasons(self, turn: Turn, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
+        """Return what the policy computed (:class:`marl_pack.exact.explaining.Explained`).
+
+        It computes it again, as other bins may have asked it since.
+        """
+        if not isinstance(self.policy, Explained):
+            return Reasons()
+        with self.lock:
+            self.policy(turn)
+            return self.policy.reasons(turn, g, moves, move)
 
 
 class Policies:

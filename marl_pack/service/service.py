@@ -180,7 +180,8 @@ class Service:
             arguments.get("grid_mm"), arguments.get("seed", 0),
         )  # fmt: skip
         boxes = () if present is None else Plan.of_dict(present, "present")
-        return Packer(policy=policy, spec=spec, present=boxes)
+        explain = arguments.get("explain", False)
+        return Packer(policy=policy, spec=spec, present=boxes, explain=explain)
 
     def list(self, after: str | None, limit: int) -> dict[str, Any]:
         """Return bins in the order in which they were opened, those after bin ``after``."""

@@ -15,6 +15,7 @@ from marl_pack.plan import Plan
 from marl_pack.replay.document import contacts, make_document
 from marl_pack.replay.page import make_page
 from tests.browser.conftest import OUT, until
+from tests.service_program import serving
 
 
 def write(path: Path, plan: Plan, title: str, live: str | None = None) -> str:
@@ -415,6 +416,28 @@ def test_a_live_page_follows_a_plan_that_grows(open_page, pallet, tmp_path, log)
     assert step(page) == 0  # who looks at an earlier step stays there
     page.close()
     server.shutdown()
+
+
+def test_the_service_shows_a_bin_while_it_is_packed(open_page, tmp_path, log) -> None:
+    httpx = pytest.importorskip("httpx2")
+    with serving(["--data", str(tmp_path / "bins.sqlite")]) as (_, address):
+        bin_url = f"{address}/bins/cell"
+        assert (
+            httpx.post(f"{address}/bins", json={"id": "cell", "explain": True}).status_code == 201
+        )
+        page = open_page(f"{bin_url}/replay")
+        assert text(page, "#live") == "live"
+        for k in range(3):
+            box = {"sides": [400, 300, 200], "id": f"box {k}", "weight": 3}
+            answer = httpx.post(f"{bin_url}/place", json=box).json()
+            until(page, f"page.step === {k + 1}")
+            shown = numbers(text(page, "#box dd[data-key=position]"))
+            assert shown == [answer["x"], answer["y"], answer["z"]]
+            assert "legal placements" in text(page, "#why-summary")
+        log(f"service: {text(page, '#caption')}, {text(page, '#live')}")
+        httpx.post(f"{bin_url}/undo")
+        until(page, "page.step === 2")
+        page.close()
 
 
 def test_screenshots(open_page, pallet, orders) -> None:
