@@ -36,7 +36,7 @@ from marl_pack.service.app import make_app
 from marl_pack.service.limits import ServiceLimits
 from marl_pack.service.refusals import CODES
 from marl_pack.service.service import Service
-from marl_pack.service.store import Store
+from marl_pack.service.store import Store, StoreError
 
 CARTONS = [[600, 400, 300], [400, 300, 250], [300, 200, 120], [395, 295, 285], [500, 310, 180]]
 SCHEMA = json.loads((Path(marl_pack.__file__).parent / "plan.schema.json").read_text())
@@ -508,15 +508,29 @@ def test_requests_that_wait_share_a_commit(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     commits = []
     store._file.set_trace_callback(lambda text: commits.append(text) if text == "COMMIT" else None)
-    with store._lock, ThreadPoolExecutor(8) as pool:
-        work = [pool.submit(store.add_bin, str(k), "now", "{}", "{}", None) for k in range(8)]
-        wait_until(lambda: len(store._waiting) == 8)
-        store._lock.release()
+    with ThreadPoolExecutor(8) as pool:
+        with store._lock:
+            work = [pool.submit(store.add_bin, str(k), "now", "{}", "{}", None) for k in range(8)]
+            wait_until(lambda: len(store._waiting) == 8)
         for each in work:
             each.result()
-        store._lock.acquire()
     assert len(commits) == 1
     assert store.count_open() == 8
+    store.close()
+
+
+def test_a_write_that_fails_fails_for_all_that_share_the_commit(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    texts: list[Any] = ["1", "2", "\ud800", "4"]  # the third cannot be stored
+    with ThreadPoolExecutor(4) as pool:
+        with store._lock:
+            work = [pool.submit(store.add_bin, text, "now", "{}", "{}", None) for text in texts]
+            wait_until(lambda: len(store._waiting) == 4)
+        for each in work:
+            with pytest.raises(StoreError, match="cannot be written"):
+                each.result()
+    assert store.count_open() == 0
+    store.add_bin("1", "now", "{}", "{}", None)
     store.close()
 
 
