@@ -377,17 +377,19 @@ def test_nobody_waits_while_a_policy_thinks_except_for_its_own_bin(tmp_path: Pat
         done(client.post("/bins", json={"id": "fast"}), 201)
         bin = client.service._bin("slow")  # type: ignore[attr-defined]
         with ThreadPoolExecutor(8) as pool:
-            waiting = []
-            for k in range(6):  # one after the other, so that their order is known
-                box = {"sides": [100 + k, 100, 100], "id": str(k)}
-                waiting.append(pool.submit(client.post, "/bins/slow/place", json=box))
-                wait_until(lambda k=k: len(bin.turn._waiters or ()) == k and bin.turn.locked())
-            assert done(client.get("/health"))["status"] == "ok"
-            assert done(client.get("/bins/slow"))["boxes"] == 0
-            assert done(client.get("/bins/slow/plan"))["boxes"] == []
-            assert done(client.post("/bins/fast/place", json={"sides": [9, 9, 9]}))["placed"]
-            assert not any(future.done() for future in waiting)
-            go.touch()
+            try:
+                waiting = []
+                for k in range(6):  # one after the other, so that their order is known
+                    box = {"sides": [100 + k, 100, 100], "id": str(k)}
+                    waiting.append(pool.submit(client.post, "/bins/slow/place", json=box))
+                    wait_until(lambda k=k: len(bin.turn._waiters or ()) == k and bin.turn.locked())
+                assert done(client.get("/health"))["status"] == "ok"
+                assert done(client.get("/bins/slow"))["boxes"] == 0
+                assert done(client.get("/bins/slow/plan"))["boxes"] == []
+                assert done(client.post("/bins/fast/place", json={"sides": [9, 9, 9]}))["placed"]
+                assert not any(future.done() for future in waiting)
+            finally:
+                go.touch()
             steps = [done(future.result())["step"] for future in waiting]
         assert steps == [1, 2, 3, 4, 5, 6]
         plan = Plan.of_dict(done(client.get("/bins/slow/plan")), "plan")

@@ -15,7 +15,7 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,8 @@ class Store:
             self._file.execute("COMMIT")
         except Exception as error:  # whatever it is, no thread may take its statement for done
             if self._file.in_transaction:
-                self._file.execute("ROLLBACK")
+                with suppress(sqlite3.Error):  # the next write fails, too, and tries it again
+                    self._file.execute("ROLLBACK")
             return error
         return None
 
