@@ -255,9 +255,9 @@ def test_other_requests_that_are_refused(client: TestClient) -> None:
         415, "wrong_type", "Content-Type 'text/plain': needs application/json",
     )  # fmt: skip
     assert error(client.post("/bins", content="{}"))[1] == "wrong_type"
-    endless = (b" " * 10_000 for _ in range(10**6))
+    chunks = (b" " * 10_000 for _ in range(40))
     headers = {"Content-Type": "application/json"}  # and no Content-Length
-    assert error(client.post("/bins", content=endless, headers=headers))[1] == "too_large"
+    assert error(client.post("/bins", content=chunks, headers=headers))[1] == "too_large"
     assert error(client.get("/bins", params={"after": "nowhere"}))[1] == "unknown_bin"
     assert error(client.get("/bins", params={"limit": 0}))[1] == "impossible"
     assert error(client.post("/bins", headers=keyed("k" * 201)))[1] == "impossible"
