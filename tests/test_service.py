@@ -36,7 +36,7 @@ from marl_pack.service.app import make_app
 from marl_pack.service.limits import ServiceLimits
 from marl_pack.service.refusals import CODES
 from marl_pack.service.service import Service
-from marl_pack.service.store import Store
+from marl_pack.service.store import Store, StoreError
 
 CARTONS = [[600, 400, 300], [400, 300, 250], [300, 200, 120], [395, 295, 285], [500, 310, 180]]
 SCHEMA = json.loads((Path(marl_pack.__file__).parent / "plan.schema.json").read_text())
@@ -255,9 +255,9 @@ def test_other_requests_that_are_refused(client: TestClient) -> None:
         415, "wrong_type", "Content-Type 'text/plain': needs application/json",
     )  # fmt: skip
     assert error(client.post("/bins", content="{}"))[1] == "wrong_type"
-    endless = (b" " * 10_000 for _ in range(10**6))
+    chunks = (b" " * 10_000 for _ in range(40))
     headers = {"Content-Type": "application/json"}  # and no Content-Length
-    assert error(client.post("/bins", content=endless, headers=headers))[1] == "too_large"
+    assert error(client.post("/bins", content=chunks, headers=headers))[1] == "too_large"
     assert error(client.get("/bins", params={"after": "nowhere"}))[1] == "unknown_bin"
     assert error(client.get("/bins", params={"limit": 0}))[1] == "impossible"
     assert error(client.post("/bins", headers=keyed("k" * 201)))[1] == "impossible"
@@ -377,17 +377,19 @@ def test_nobody_waits_while_a_policy_thinks_except_for_its_own_bin(tmp_path: Pat
         done(client.post("/bins", json={"id": "fast"}), 201)
         bin = client.service._bin("slow")  # type: ignore[attr-defined]
         with ThreadPoolExecutor(8) as pool:
-            waiting = []
-            for k in range(6):  # one after the other, so that their order is known
-                box = {"sides": [100 + k, 100, 100], "id": str(k)}
-                waiting.append(pool.submit(client.post, "/bins/slow/place", json=box))
-                wait_until(lambda k=k: len(bin.turn._waiters or ()) == k and bin.turn.locked())
-            assert done(client.get("/health"))["status"] == "ok"
-            assert done(client.get("/bins/slow"))["boxes"] == 0
-            assert done(client.get("/bins/slow/plan"))["boxes"] == []
-            assert done(client.post("/bins/fast/place", json={"sides": [9, 9, 9]}))["placed"]
-            assert not any(future.done() for future in waiting)
-            go.touch()
+            try:
+                waiting = []
+                for k in range(6):  # one after the other, so that their order is known
+                    box = {"sides": [100 + k, 100, 100], "id": str(k)}
+                    waiting.append(pool.submit(client.post, "/bins/slow/place", json=box))
+                    wait_until(lambda k=k: len(bin.turn._waiters or ()) == k and bin.turn.locked())
+                assert done(client.get("/health"))["status"] == "ok"
+                assert done(client.get("/bins/slow"))["boxes"] == 0
+                assert done(client.get("/bins/slow/plan"))["boxes"] == []
+                assert done(client.post("/bins/fast/place", json={"sides": [9, 9, 9]}))["placed"]
+                assert not any(future.done() for future in waiting)
+            finally:
+                go.touch()
             steps = [done(future.result())["step"] for future in waiting]
         assert steps == [1, 2, 3, 4, 5, 6]
         plan = Plan.of_dict(done(client.get("/bins/slow/plan")), "plan")
@@ -508,15 +510,29 @@ def test_requests_that_wait_share_a_commit(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     commits = []
     store._file.set_trace_callback(lambda text: commits.append(text) if text == "COMMIT" else None)
-    with store._lock, ThreadPoolExecutor(8) as pool:
-        work = [pool.submit(store.add_bin, str(k), "now", "{}", "{}", None) for k in range(8)]
-        wait_until(lambda: len(store._waiting) == 8)
-        store._lock.release()
+    with ThreadPoolExecutor(8) as pool:
+        with store._lock:
+            work = [pool.submit(store.add_bin, str(k), "now", "{}", "{}", None) for k in range(8)]
+            wait_until(lambda: len(store._waiting) == 8)
         for each in work:
             each.result()
-        store._lock.acquire()
     assert len(commits) == 1
     assert store.count_open() == 8
+    store.close()
+
+
+def test_a_write_that_fails_fails_for_all_that_share_the_commit(tmp_path: Path) -> None:
+    store = Store(tmp_path / "a.sqlite")
+    texts: list[Any] = ["1", "2", "\ud800", "4"]  # the third cannot be stored
+    with ThreadPoolExecutor(4) as pool:
+        with store._lock:
+            work = [pool.submit(store.add_bin, text, "now", "{}", "{}", None) for text in texts]
+            wait_until(lambda: len(store._waiting) == 4)
+        for each in work:
+            with pytest.raises(StoreError, match="cannot be written"):
+                each.result()
+    assert store.count_open() == 0
+    store.add_bin("1", "now", "{}", "{}", None)
     store.close()
 
 

@@ -15,7 +15,7 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ class _Write:
     statement: str
     values: tuple[Any, ...]
     done: bool = False
-    error: sqlite3.Error | None = None
+    error: Exception | None = None
 
 
 class Store:
@@ -184,16 +184,17 @@ class Store:
         if mine.error is not None:
             raise StoreError(f"the data cannot be written ({mine.error})") from mine.error
 
-    def _commit(self, batch: Sequence[_Write]) -> sqlite3.Error | None:
+    def _commit(self, batch: Sequence[_Write]) -> Exception | None:
         """Do statements in one transaction; return the error if it failed and was undone."""
         try:
             self._file.execute("BEGIN IMMEDIATE")
             for write in batch:
                 self._file.execute(write.statement, write.values)
             self._file.execute("COMMIT")
-        except sqlite3.Error as error:
+        except Exception as error:  # whatever it is, no thread may take its statement for done
             if self._file.in_transaction:
-                self._file.execute("ROLLBACK")
+                with suppress(sqlite3.Error):  # the next write fails, too, and tries it again
+                    self._file.execute("ROLLBACK")
             return error
         return None
 
