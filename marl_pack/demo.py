@@ -80,8 +80,8 @@ def parser(program: str = PROGRAM) -> Parser:
         help="what chooses the places (default: search, for 0.1 s a box)")  # fmt: skip
     add("--seed", type=int, default=0, help="seed of the cases (default: 0)")
     add("--out", type=Path, default=Path("demo.html"), metavar="FILE",
-        help="the page (.html); the plan is beside it, with the ending .json (default: demo.html)"
-        )  # fmt: skip
+        help="the page (.html); the plan is written beside it, with the ending .json; files that "
+             "are there already are replaced (default: demo.html)")  # fmt: skip
     add("--no-open", action="store_true", help="do not open the page in the browser")
     return options
 

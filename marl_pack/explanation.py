@@ -19,7 +19,9 @@ COLUMNS = ("orientation", "x", "y", "z")
 NUMBERS = ("probabilities", "values")
 KEYS = ("legal", "chosen", "placements")
 """Keys that every explanation has in JSON."""
-OPTIONAL = ("orientation_probabilities", *NUMBERS, "value_of")
+OPTIONAL = ("orientation_probabilities", *NUMBERS, "value_of", "tries", "probability_of")
+PROBABILITY_OF = ("placement", "cell")
+"""What the probabilities may be of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,9 @@ class Explanation:
         probabilities: float64 [M], of the placement agent, given the chosen orientation; or None.
         values: float64 [M], what the policy expects of each placement; or None.
         value_of: what the values are, such as ``"score"``; "" without values.
+        tries: int64 [M], number of futures behind each value; None if values are no means.
+        probability_of: what has the probability: ``"placement"``, or ``"cell"`` of a grid in which
+            several placements may lie.
     """
 
     legal: int
@@ -47,16 +52,22 @@ class Explanation:
     probabilities: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
     value_of: str = ""
+    tries: NDArray[np.int64] | None = None
+    probability_of: str = PROBABILITY_OF[0]
 
     def shortened(self, most: int = MOST_LISTED) -> Explanation:
         """Return the explanation with at most ``most`` placements: the chosen and the best ones.
 
-        The best ones have the highest value, or else the highest probability.
+        The best ones have the highest value, or else the highest probability. Without either,
+        every so many placements one stays.
         """
         count = len(self.orientations)
         if count <= most:
             return self
-        ranks: list[NDArray[Any]] = [np.arange(count)]
+        # Of placements that are equally good, evenly spaced ones are kept.
+        spaced = np.zeros(count, np.int64)
+        spaced[np.linspace(0, count - 1, most).round().astype(np.int64)] = -1
+        ranks: list[NDArray[Any]] = [np.arange(count), spaced]
         for numbers in (self.probabilities, self.values):
             if numbers is not None:
                 ranks.append(-np.nan_to_num(numbers, nan=-np.inf))
@@ -69,6 +80,7 @@ class Explanation:
             positions=self.positions[kept],
             probabilities=None if self.probabilities is None else self.probabilities[kept],
             values=None if self.values is None else self.values[kept],
+            tries=None if self.tries is None else self.tries[kept],
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -86,6 +98,10 @@ class Explanation:
                 content[key] = [None if v != v else float(f"{v:.6g}") for v in numbers.tolist()]
         if self.value_of:
             content["value_of"] = self.value_of
+        if self.tries is not None:
+            content["tries"] = self.tries.tolist()
+        if self.probability_of != PROBABILITY_OF[0]:
+            content["probability_of"] = self.probability_of
         return content
 
     @classmethod
@@ -122,10 +138,20 @@ class Explanation:
         value_of = content.get("value_of", "")
         if not isinstance(value_of, str):
             raise ValueError(f"{source}: value_of: needs a text")
+        probability_of = content.get("probability_of", PROBABILITY_OF[0])
+        if probability_of not in PROBABILITY_OF:
+            raise ValueError(f"{source}: probability_of: needs {' or '.join(PROBABILITY_OF)}")
+        tries = None
+        if "tries" in content:
+            given = _numbers(content, "tries", source, count)
+            if not ((given >= 0) & (given < 2**53) & (given == np.floor(given))).all():
+                raise ValueError(f"{source}: tries: needs whole numbers ≥ 0")
+            tries = given.astype(np.int64)
         positions = np.column_stack([columns[key] for key in "xyz"])
         return cls(
-            legal, chosen, orientations.astype(np.int64), positions, **others, value_of=value_of
-        )
+            legal, chosen, orientations.astype(np.int64), positions, **others, value_of=value_of,
+            tries=tries, probability_of=probability_of,
+        )  # fmt: skip
 
 
 def _plain(value: float) -> int | float:

@@ -82,6 +82,9 @@ def test_a_search_says_what_the_tried_moves_are_worth() -> None:
         assert why.values is not None
         known = why.values[np.isfinite(why.values)]
         assert len(known) <= 4
+        assert why.tries is not None
+        assert ((why.tries > 0) == np.isfinite(why.values)).all()
+        assert why.tries.max() <= 8 * 4
         # Each share has the boxes that are there and the new one, and is at most 1.
         assert (known >= plan.first(k + 1).utilization - 1e-9).all()
         assert (known <= 1).all()
@@ -97,6 +100,7 @@ def test_agents_on_a_grid_say_their_probabilities() -> None:
         assert why.probabilities is not None
         own = why.orientations == why.orientations[why.chosen]
         assert np.isnan(why.probabilities[~own]).all()
+        assert why.probability_of == "cell"
         assert why.probabilities[why.chosen] == np.nanmax(why.probabilities)
 
 
@@ -138,7 +142,11 @@ def test_a_joint_agent_and_a_search_on_cells_are_explained() -> None:
         assert why.values is not None
         known = np.isfinite(why.values)
         assert known.sum() == 3
-        assert why.values[why.chosen] == why.values[known].max() > 0.3
+        assert why.tries is not None
+        assert ((why.tries > 0) == known).all()
+        assert why.tries[why.chosen] == why.tries.max()
+        last = why.tries == why.tries.max()  # the placements of the last round
+        assert why.values[why.chosen] == why.values[last].max() > 0.3
         assert why.orientations[why.chosen] == int(choice[0][g])
 
 
@@ -186,6 +194,11 @@ def test_long_lists_keep_the_chosen_and_the_best() -> None:
     assert short.values[short.chosen] == 7
     assert set(short.values.tolist()) == {7.0, *values[-MOST_LISTED + 1 :].tolist()}
     assert short.legal == count
+    plain = Explanation(count, 7, np.zeros(count, np.int64), np.zeros((count, 3)) + values[:, None])
+    spaced = plain.shortened().positions[:, 0]
+    assert len(spaced) == MOST_LISTED
+    assert 7 in spaced
+    assert np.diff(spaced).max() <= 2  # no part of the list is missing
     assert long.shortened(count) is long
 
 
@@ -210,6 +223,8 @@ WRONG: dict[str, Any] = {
     "values": lambda w: {**w, "values": [1.0]},
     "number": lambda w: {**w, "values": ["a"] * len(w["placements"]["x"])},
     "value_of": lambda w: {**w, "value_of": 4},
+    "tries": lambda w: {**w, "tries": [0.5] * len(w["placements"]["x"])},
+    "probability_of": lambda w: {**w, "probability_of": "bin"},
     "orientation_probabilities": lambda w: {**w, "orientation_probabilities": [1, 0]},
 }  # fmt: skip
 
@@ -248,7 +263,12 @@ def test_programs_write_explanations(tmp_path: Path) -> None:
     assert evaluate.main([*world, *episodes]) == 0
     plans = load_plans(out)
     assert len(plans) == 3
-    assert all(all(plan.explanations) and len(plan.explanations) for plan in plans)
+    for plan in plans:
+        assert plan.unit_mm == 0.1
+        assert len(plan.explanations) == len(plan) > 1
+        for why, position in zip(plan.explanations, plan.positions, strict=True):
+            assert why is not None
+            assert why.positions[why.chosen].tolist() == position.tolist()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,8 @@ ONLY = {
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
              "option_record", "renamed", "stability"},
     "render": {"bins", "extras", "files", "geometry", "plan", "render"},
-    "replay": {"checks", "files", "plan", "plan_archive", "render", "replay", "terminal"},
+    "replay": {"checks", "files", "geometry", "plan", "plan_archive", "render", "replay",
+               "terminal"},
 }  # fmt: skip
 
 

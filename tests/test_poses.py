@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_pack import Plan, Stack
+from marl_pack.geometry.rotated import overlap, overlap_area
 from marl_pack.packer.answers import Placement
 from marl_pack.packer.packer import Packer
-from marl_pack.packer.poses import Pose, overlap, rectangles
+from marl_pack.packer.poses import Pose, rectangles
 from marl_pack.sapien_check.trials import Trial, run_trial
 
 SIDES = st.integers(1, 4000)
@@ -236,3 +237,23 @@ def test_the_judge_refuses_rotated_boxes_that_overlap_or_float() -> None:
     Stack.of_cells((700, 500, 500), [lower, upper], cell=0.001, density=500)
     with pytest.raises(ValueError, match="floats"):
         Stack.of_cells((700, 500, 500), [lower, upper], cell=0.001, density=500, yaw=[0, 45])
+
+
+def test_the_shared_area_is_that_of_the_two_rectangles() -> None:
+    assert overlap_area((0, 0, 4, 2, 0), (1, 0, 4, 2, 0)) == pytest.approx(6)
+    assert overlap_area((0, 0, 4, 4, 0), (0, 0, 4, 4, 45)) == pytest.approx(16 * 2 * (2**0.5 - 1))
+    assert overlap_area((0, 0, 2, 2, 30), (9, 0, 2, 2, 10)) == 0
+    assert overlap_area((3, 5, 10, 8, 20), (3, 5, 2, 1, -40)) == pytest.approx(2)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        a, b = (
+            (*generator.uniform(0, 3, 2), *generator.uniform(1, 4, 2), generator.uniform(-45, 45))
+            for _ in range(2)
+        )
+        points = generator.uniform(-4, 7, (40_000, 2))
+        inside = np.ones(len(points), np.bool_)
+        for x, y, w, d, yaw in (a, b):
+            cos, sin = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+            dx, dy = points[:, 0] - x, points[:, 1] - y
+            inside &= (abs(dx * cos + dy * sin) <= w / 2) & (abs(dy * cos - dx * sin) <= d / 2)
+        assert overlap_area(a, b) == pytest.approx(121 * inside.mean(), abs=0.25)

@@ -16,6 +16,8 @@ import pytest
 from PIL import Image
 
 from marl_pack import Packer, Plan, demo
+from marl_pack.explanation import Explanation
+from marl_pack.plan import LeftOut
 from marl_pack.plan_archive import save_plans
 from marl_pack.render.animation import BAR, Film, save_film
 from marl_pack.render.colours import COLOURINGS, PALETTE, SCALE, UNKNOWN, colour_plan
@@ -74,6 +76,21 @@ def test_boxes_of_other_bins_carry_nothing() -> None:
     assert shares.tolist() == [1, 0]
 
 
+def test_rotated_boxes_rest_on_what_is_under_them() -> None:
+    boxes = [
+        (100, 250, 0, 600, 100, 100),
+        (600, 100, 100, 100, 100, 50),
+        (100, 280, 100, 50, 40, 50),
+    ]
+    straight = Plan.of_boxes((800, 800, 400), boxes, unit_mm=1)
+    assert contacts(straight)[0] == [[], [], [0]]
+    rotated = replace(straight, yaws=np.array([-30.0, 0, 0]))
+    below, shares = contacts(rotated)
+    assert below == [[], [0], []]
+    assert 0 < shares[1] < 1
+    assert shares[2] == 0
+
+
 def test_support_shares_of_the_plan_are_kept() -> None:
     packer = Packer((600, 400, 400), rule="none")
     for sides in [(300, 200, 100), (500, 400, 100), (200, 200, 50)]:
@@ -83,10 +100,26 @@ def test_support_shares_of_the_plan_are_kept() -> None:
     assert contacts(plan)[1] == pytest.approx(plan.supports)
 
 
-@pytest.mark.parametrize(("unit", "name"), [(None, "cells"), (1.0, "mm"), (10.0, "× 10 mm")])
-def test_lengths_have_the_name_of_their_unit(unit: float | None, name: str) -> None:
-    plan = Plan.of_boxes((4, 4, 4), [(0, 0, 0, 2, 2, 2)], unit_mm=unit)
-    assert make_document(plan)["unit"] == name
+@pytest.mark.parametrize(
+    ("unit", "name", "scale"), [(None, "cells", 1), (1.0, "mm", 1), (10.0, "mm", 10)]
+)
+def test_lengths_are_in_millimetres_if_the_plan_knows_them(
+    unit: float | None, name: str, scale: float
+) -> None:
+    why = Explanation(2, 1, np.array([0, 1]), np.array([[0.0, 0, 0], [1, 1, 0]]))
+    plan = replace(
+        Plan.of_boxes((4, 4, 4), [(1, 1, 0, 2, 2, 1.5)], unit_mm=unit),
+        margins=np.array([0.5]), left_out=(LeftOut("a", (9, 1, 1), "too long"),),
+        explanations=(why,),
+    )  # fmt: skip
+    document = make_document(plan)
+    assert document["unit"] == name
+    assert document["bins"] == [[4 * scale] * 3]
+    box = document["boxes"][0]
+    assert [box[key] for key in "xyzwdh"] == [v * scale for v in (1, 1, 0, 2, 2, 1.5)]
+    assert box["margin"] == 0.5 * scale
+    assert document["left_out"][0]["w"] == 9 * scale
+    assert document["explanations"][0]["placements"]["x"] == [0, scale]
 
 
 def test_the_page_has_everything_in_it_and_runs_nothing_else(plan: Plan) -> None:
@@ -193,7 +226,32 @@ def test_films_show_every_box(plan: Plan, tmp_path: Path) -> None:
     save_film(tmp_path / "film.mp4", Film(plan, pixels=(321, 241)), seconds=0.2)
     reader = imageio.get_reader(tmp_path / "film.mp4")
     assert reader.get_meta_data()["size"] == (320, 240)
-    assert abs(reader.count_frames() - (2 * len(plan) + 30)) <= 1
+    # 20 pictures a second: 0.2 s for each frame, and 3 s for the last one
+    assert abs(reader.count_frames() - (4 * len(plan) + 60)) <= 1
+    save_film(tmp_path / "film.mp4", Film(plan, pixels=(320, 240)), seconds=0.13)
+    frames = imageio.get_reader(tmp_path / "film.mp4").count_frames()
+    assert abs(frames - 20 * (0.13 * len(plan) + 3)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("boxes", "yaws", "unit"),
+    [([(0.4, 0.3, 0, 0.4, 0.3, 0.2)], [10.0], 1000.0), ([(2, 2, 0, 2, 2, 2)], [5.0], None),
+     ([(100, 300, 0, 600, 100, 100)], [45.0], 1.0), ([(0, 0, 0, 1 / 3, 1 / 3, 1 / 3)], [0.0], 1.0),
+     ([(1e-6, 0, 0, 2e-6, 2e-6, 2e-6)], [0.0], None), ([(1e8, 1e8, 0, 4e8, 3e8, 2e8)], [3.0], 1.0)],
+)  # fmt: skip
+def test_every_plan_without_overlaps_can_be_drawn(
+    boxes: Any, yaws: list[float], unit: float | None, tmp_path: Path
+) -> None:
+    size = [10 ** np.ceil(np.log10(np.max(boxes)))] * 3
+    plan = replace(Plan.of_boxes(size, boxes, unit_mm=unit), yaws=np.array(yaws))
+    save_film(tmp_path / "bin.png", Film(plan))
+    assert (tmp_path / "bin.png").stat().st_size > 3000
+
+
+def test_a_picture_of_very_many_pixels_is_refused(plan: Plan, tmp_path: Path) -> None:
+    two = Film(plan, pixels=(9000, 9000))
+    with pytest.raises(ValueError, match="a picture of 2 bins of 9000 x 9000 pixels each has more"):
+        save_film(tmp_path / "bins.png", two)
 
 
 def test_a_picture_shows_all_bins_that_were_opened(plan: Plan, tmp_path: Path) -> None:
@@ -240,7 +298,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--out", "film.gif", "--seconds", "nan"], "--seconds"),
     (["--out", "bin.png", "--pixels", "10", "10"], "--pixels"),
     (["--out", "bin.png", "--step", "12"], "--step"),
-    (["--out", "page.html", "--episode", "1"], "--episode 1: needs a number from 0 to 0"),
+    (["--out", "page.html", "--episode", "1"], "--episode 1: needs 0, the only plan of the file"),
     (["--out", "nowhere/page.html"], "nowhere"),
 ]
 
@@ -259,6 +317,22 @@ def test_impossible_options_are_refused(
     assert words in error
     assert "Traceback" not in error
     assert sorted(path.parent.iterdir()) == before
+
+
+def test_a_plan_that_cannot_be_drawn_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "over.json"
+    Plan.of_boxes((4, 4, 4), [(0, 0, 0, 2, 2, 2), (1, 1, 0, 2, 2, 2)]).to_json(path)
+    for out, words in (("bin.png", "over.json: boxes overlap"), ("film.gif", "boxes overlap")):
+        with pytest.raises(SystemExit):
+            command.main([str(path), "--out", str(tmp_path / out)])
+        assert words in capsys.readouterr().err
+    assert command.main([str(path), "--out", str(tmp_path / "page.html")]) == 0
+    named = ["--out", str(tmp_path / "bin.png"), "--colour", "margin"]
+    with pytest.raises(SystemExit):
+        command.main([str(path), *named])
+    assert "--colour margin: the plan has no such values" in capsys.readouterr().err
 
 
 def test_a_missing_or_foreign_plan_is_refused(

@@ -69,4 +69,5 @@ def _of_game(
         probabilities,
         None if values is None else values[g].double().cpu().numpy()[at],
         reasons.value_of,
+        None if reasons.tries is None else reasons.tries[g].cpu().numpy()[at],
     ).shortened()

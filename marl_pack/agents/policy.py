@@ -32,6 +32,8 @@ PlacementAgent = Callable[[Packing, Tensor], Tensor]
 
 AFTERSTATE_VALUE = "afterstate value"
 """Name of the values that learned agents observe: reward (Eq. 5) plus the return still to come."""
+OF_FIRST_AGENT = "afterstate value, seen by the orientation agent"
+"""Their name if the placement agent does not observe them."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Reasons:
     probabilities: Tensor | None = None  # [G, W · D]  of the cells in the chosen orientation
     values: Tensor | None = None  # [G, 6, W, D]  the highest is the best; NaN: not computed
     value_of: str = ""  # what the values are
+    tries: Tensor | None = None  # int64 [G, 6, W, D]  number of futures behind each value
 
 
 @runtime_checkable
@@ -71,15 +74,16 @@ class InTurns:
     def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
         """Return what learned agents computed (:class:`Explained`)."""
         first, second = self.orientation_agent, self.placement_agent
-        values = None
-        for agent in (first, second):
+        values, value_of = None, ""
+        for agent, name in ((second, AFTERSTATE_VALUE), (first, OF_FIRST_AGENT)):
             if values is None and hasattr(agent, "values"):
                 values = agent.values(game)
+                value_of = "" if values is None else name
         return Reasons(
             first.chances(game) if hasattr(first, "chances") else None,
             second.chances(game, orientation) if hasattr(second, "chances") else None,
             values,
-            "" if values is None else AFTERSTATE_VALUE,
+            value_of,
         )
 
 

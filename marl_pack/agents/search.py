@@ -59,8 +59,9 @@ class Planner:
         self.orientation_agent, self.placement_agent = orientation_agent, placement_agent
         self.critic, self.settings, self.futures = critic, settings, futures
         self.seed = -1 - seed  # real games have seeds ≥ 0: the futures differ from them
-        # Of each round of the last call: games, their pairs, which are legal, and their means.
-        self._tried: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        # Of each round of the last call: games, their pairs, which are legal, their means, and
+        # the number of futures behind these.
+        self._tried: list[tuple[Tensor, Tensor, Tensor, Tensor, int]] = []
 
     @torch.inference_mode()
     def __call__(self, game: Packing, moves: Moves | None = None) -> Placement:
@@ -89,7 +90,7 @@ class Planner:
             k = max(1, budget // (rounds * pairs.shape[1]))
             total[legal] += self._sum(game, index, pairs, legal, played, k)
             played += k
-            self._tried.append((index, pairs, legal, total / played))
+            self._tried.append((index, pairs, legal, total / played, played))
             remaining = 1 if rounds_left == 1 else -(-pairs.shape[1] // 2)
             better = total.masked_fill(~legal, -torch.inf).topk(remaining, 1).indices
             pairs, legal, total = (x.gather(1, better) for x in (pairs, legal, total))
@@ -103,13 +104,15 @@ class Planner:
         (:class:`marl_pack.agents.policy.Explained`).
         """
         values = torch.full(game.mask.shape, torch.nan, dtype=torch.float64, device=game.device)
-        for index, pairs, legal, means in self._tried:
+        tries = torch.zeros(game.mask.shape, dtype=torch.int64, device=game.device)
+        for index, pairs, legal, means, played in self._tried:
             row, rank = legal.nonzero().unbind(1)
             values.view(game.n, -1)[index[row], pairs[row, rank]] = means[row, rank]
+            tries.view(game.n, -1)[index[row], pairs[row, rank]] = played
         return Reasons(
             self.orientation_agent.chances(game),
             self.placement_agent.chances(game, orientation),
-            values, "mean result of imagined games",
+            values, "mean result of imagined games", tries,
         )  # fmt: skip
 
     def _sum(

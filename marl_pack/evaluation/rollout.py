@@ -161,7 +161,7 @@ def batches_mm(
             explanations = None
             if explained:
                 explanations = [
-                    explain(policy, games, g, int(moves[g])) if alive else None
+                    explain(policy, games, g, int(moves[g]), in_mm=False) if alive else None
                     for g, alive in enumerate(games.alive.tolist())
                 ]
             outcome = games.place(moves)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marl_pack.exact.bins import placements
 from marl_pack.exact.lengths import to_mm
-from marl_pack.explanation import Explanation
+from marl_pack.explanation import PROBABILITY_OF, Explanation
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,8 @@ class Reasons:
     value_of: str = ""  # what the values are
     orientation_probabilities: NDArray[np.float64] | None = None  # [6]
     probabilities: NDArray[np.float64] | None = None  # [M]  NaN in other orientations
+    tries: NDArray[np.int64] | None = None  # [M]  number of futures behind each value
+    probability_of: str = PROBABILITY_OF[0]
 
 
 @runtime_checkable
@@ -38,7 +40,7 @@ class Explained(Protocol):
         """
 
 
-def explain(policy: Any, game: Any, g: int, move: int) -> Explanation:
+def explain(policy: Any, game: Any, g: int, move: int, in_mm: bool = True) -> Explanation:
     """Explain a policy's choice in one game.
 
     Args:
@@ -46,20 +48,22 @@ def explain(policy: Any, game: Any, g: int, move: int) -> Explanation:
         game: the games (:class:`marl_pack.exact.packing.ExactPacking`), before the placement.
         g: number of the game.
         move: its choice.
-
-    Returns:
-        The explanation; lengths are in millimetres.
+        in_mm: whether lengths are in millimetres, as in plans of the packer; if not, they are in
+            units, as in plans of games.
     """
     moves = game.moves.of(g)
     reasons = policy.reasons(game, g, moves, move) if isinstance(policy, Explained) else Reasons()
     where, chosen = placements(moves), np.flatnonzero(moves == move)
+    corners = where[:, 1:]
     return Explanation(
         len(moves),
         int(chosen[0]) if len(chosen) else -1,
         where[:, 0],
-        np.asarray(to_mm(where[:, 1:], game.spec.unit_mm), np.float64),
+        np.asarray(to_mm(corners, game.spec.unit_mm) if in_mm else corners, np.float64),
         reasons.orientation_probabilities,
         reasons.probabilities,
         reasons.values,
         reasons.value_of,
+        reasons.tries,
+        reasons.probability_of,
     ).shortened()

@@ -141,7 +141,8 @@ class Search:
 
     def __post_init__(self) -> None:
         self.played = 0  # futures played so far
-        # Of the last call: the moves tried in each game, and their mean results.
+        # Of the last call: the moves tried in each game, the volumes [futures, moves] that were
+        # placed after them (NaN: not tried).
         self._tried: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
 
     def __call__(self, game: ExactPacking) -> NDArray[np.int64]:
@@ -153,8 +154,8 @@ class Search:
             shown = game.shown(g)
             generator = np.random.default_rng((self.seed, int(game.episode[g]), len(shown)))
             bins, item = game.bins.select([g]), game.items[[g]]
-            moves[g], tried, means = self._choose(bins, item, shown, generator, begin)
-            self._tried[g] = tried, means
+            moves[g], tried, volumes = self._choose(bins, item, shown, generator, begin)
+            self._tried[g] = tried, volumes
         return moves
 
     def reasons(self, game: Any, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
@@ -162,11 +163,15 @@ class Search:
 
         They are filled shares of the bin (:class:`marl_pack.exact.explaining.Explained`).
         """
-        tried, means = self._tried[g]
+        tried, volumes = self._tried[g]
+        counts = np.isfinite(volumes).sum(0)
+        means = np.where(counts, np.nansum(volumes, 0) / np.maximum(counts, 1), np.nan)
         filled = game.bins.utilization[g] + float(game.items.volumes[g]) / game.bins.volume
         values = np.full(len(moves), np.nan)
         values[np.searchsorted(moves, tried)] = filled + means / game.bins.volume
-        return Reasons(values, "mean filled share in futures")
+        tries = np.zeros(len(moves), np.int64)
+        tries[np.searchsorted(moves, tried)] = counts
+        return Reasons(values, "mean filled share in futures", tries=tries)
 
     def ranked(self, bins: ExactBins, item: Goods) -> NDArray[np.int64]:
         """Return the best moves of an item in the only bin by the linear score, the best first."""
@@ -178,11 +183,11 @@ class Search:
         self, bins: ExactBins, item: Goods, shown: Goods, generator: np.random.Generator,
         begin: int,
     ) -> tuple[int, NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
-        """Return the best move of an item in the only bin, the moves tried and their means."""
+        """Return the best move of an item in the only bin, the moves tried and their results."""
         moves = self.ranked(bins, item)
         room = bins.spec.max_boxes - int(bins.state.count[0]) - 1
         if len(moves) < 2 or not room:
-            return int(moves[0]) if len(moves) else NOWHERE, moves, np.full(len(moves), np.nan)
+            return int(moves[0]) if len(moves) else NOWHERE, moves, np.empty((0, len(moves)))
         trial = _Trial(self.weights, bins, item, moves)
         end = begin + int(self.settings.budget_ms * MILLISECOND)
 
@@ -222,9 +227,7 @@ class Search:
             means = values[:, survivors].mean(0) if len(values) else np.zeros(len(survivors))
             order = np.argsort(-means, kind="stable")
             survivors = np.sort(survivors[order[: -(-len(survivors) // 2)]])
-        counts = np.isfinite(values).sum(0)
-        means = np.where(counts, np.nansum(values, 0) / np.maximum(counts, 1), np.nan)
-        return int(moves[self._better(int(survivors[0]), values)]), moves, means
+        return int(moves[self._better(int(survivors[0]), values)]), moves, values
 
     @staticmethod
     def _better(m: int, values: NDArray[np.float64]) -> int:

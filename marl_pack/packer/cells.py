@@ -25,6 +25,7 @@ from marl_pack.exact.goods import AXES
 from marl_pack.exact.lengths import in_units
 from marl_pack.exact.policies import HEURISTICS
 from marl_pack.exact.spec import ExactSpec
+from marl_pack.explanation import PROBABILITY_OF
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
 from marl_pack.geometry import resting_heights_and_waste
@@ -162,7 +163,7 @@ class CellAgent:
         if own.values is not None:
             of_cells = own.values[0].double().flatten(1).numpy()
             values = np.where(cells >= 0, of_cells[orientations, cells], np.nan)
-        return Reasons(values, own.value_of, first, probabilities)
+        return Reasons(values, own.value_of, first, probabilities, probability_of=PROBABILITY_OF[1])
 
     def _choose(self, turn: Turn, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Show the agents the turn on the grid, and return the moves at the cell they choose.

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from marl_pack.exact.goods import Goods
 from marl_pack.explanation import Explanation
+from marl_pack.geometry.rotated import overlap
 from marl_pack.packer.answers import Placement
-from marl_pack.packer.poses import Pose, overlap, rectangles
+from marl_pack.packer.poses import Pose, rectangles
 
 TOUCHING = 0.5
 """Units by which reported poses may overlap: they are rounded to whole units."""

@@ -1,4 +1,4 @@
-"""Rotated boxes seen from above: the rectangles around and inside them, and overlaps."""
+"""Poses that a robot reported, and the rectangles around and inside a rotated box."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_pack.checks import real_number, shown
+from marl_pack.geometry.rotated import inner_sides
 from marl_pack.plan_columns import MOST_YAW
 
 ROUNDING = 1e-9
@@ -85,46 +86,3 @@ def rectangles(
     )
     inside[2:] = np.maximum(inside[2:], inside[:2])  # nothing carries if it is that thin
     return around.astype(np.int64), inside.astype(np.int64)
-
-
-def inner_sides(w: float, d: float, cos: float, sin: float) -> tuple[float, float]:
-    """Return the sides of a large rectangle along the axes inside a rotated rectangle w × d.
-
-    A rectangle p × q with the same middle is inside if p · cos + q · sin ≤ w and
-    p · sin + q · cos ≤ d. Either both hold with equality, or the shorter side alone binds.
-    """
-    if sin == 0:
-        return w, d
-    short = min(w, d)
-    thin = short / (2 * sin), short / (2 * cos)  # the largest if one side alone binds
-    candidates = [thin, thin[::-1]]
-    double = cos * cos - sin * sin
-    if double > 0:
-        candidates.append(((w * cos - d * sin) / double, (d * cos - w * sin) / double))
-    inside = [
-        (p, q)
-        for p, q in candidates
-        if p > 0 and q > 0
-        and p * cos + q * sin <= w * (1 + 1e-12) and p * sin + q * cos <= d * (1 + 1e-12)
-    ]  # fmt: skip
-    return max(inside, key=lambda sides: sides[0] * sides[1])
-
-
-def overlap(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return by how much two rotated rectangles overlap, seen from above; negative for a gap.
-
-    It is the least overlap along a side of one of the two (separating axis theorem).
-
-    Args:
-        a, b: middle x, y, sides w, d, and the rotation in degrees.
-    """
-    least = math.inf
-    for one, other in ((a, b), (b, a)):
-        cos, sin = math.cos(math.radians(one[4])), math.sin(math.radians(one[4]))
-        turn = math.radians(other[4] - one[4])
-        c, s = abs(math.cos(turn)), abs(math.sin(turn))
-        dx, dy = other[0] - one[0], other[1] - one[1]
-        along = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-        reach = (other[2] * c + other[3] * s) / 2, (other[2] * s + other[3] * c) / 2
-        least = min(least, one[2] / 2 + reach[0] - along[0], one[3] / 2 + reach[1] - along[1])
-    return least

@@ -19,12 +19,16 @@ from marl_pack.render.picture import draw, draw_plan, drawable
 PIXELS = (720, 480)
 SECONDS, LAST_SECONDS = 0.6, 3.0
 """How long each frame is shown, and how long the last frame is shown."""
-RATE = 10
-"""Pictures a second in an MP4; a frame is shown for several of them."""
+RATE = 20
+"""Pictures a second in an MP4; a frame is shown for one or several of them."""
+MOST_PIXELS = 100_000_000
+"""Pixels of the largest picture of several bins."""
 BAR = 6
 """Height in pixels of the bar that shows how many boxes are placed."""
 DONE, WAITING = (11, 92, 173), (222, 226, 230)
 """Colours of the bar."""
+LONGEST_TITLE = 60
+"""Characters of a title; the rest of a longer one is left out."""
 SAMPLES = 12
 """Frames from which the palette of a GIF is made."""
 ENDINGS = (".png", ".gif", ".mp4")
@@ -55,7 +59,8 @@ class Film:
         pixels: tuple[int, int] = PIXELS,
         colouring: str = "item",
     ) -> None:
-        self.plan, self.title, self.pixels = plan, title, pixels
+        self.plan, self.pixels = plan, pixels
+        self.title = title if len(title) <= LONGEST_TITLE else f"{title[: LONGEST_TITLE - 1]}…"
         colours = colour_plan(plan, colouring)
         if colours is None:
             raise ValueError(f"colours by {colouring}: the plan has no such values, or only one")
@@ -112,11 +117,20 @@ class Film:
 def bins_picture(film: Film, step: int) -> Frame:
     """Draw all bins that were opened after ``step`` boxes, side by side, uint8 [rows, columns, 3].
 
-    Four bins share a row.
+    Four bins share a row. The picture of each bin has the film's size.
+
+    Raises:
+        ValueError: if it would have more than :data:`MOST_PIXELS` pixels.
     """
     plan, opened = film.plan, max(film.plan.bins[:step].tolist(), default=0) + 1
     if opened == 1:
         return film.frame(step)
+    columns, rows = film.pixels
+    if opened * columns * rows > MOST_PIXELS:
+        raise ValueError(
+            f"a picture of {opened} bins of {columns} x {rows} pixels each has more than "
+            f"{MOST_PIXELS:,} pixels: needs fewer pixels"
+        )
     pictures = []
     for k in range(opened):
         of_bin = np.flatnonzero(plan.bins[:step] == k)
@@ -124,11 +138,9 @@ def bins_picture(film: Film, step: int) -> Frame:
         title = f"bin {k + 1}: {len(packed)} boxes, {packed.utilization:.0%}"
         colours = [film.colours[i] for i in of_bin] or PALETTE
         pictures.append(draw_plan(packed, title, film.pixels, colours))
-    columns = min(4, opened)
-    blank = np.full_like(pictures[0], 255)
-    pictures += [blank] * (-opened % columns)
-    rows = [np.hstack(pictures[k : k + columns]) for k in range(0, len(pictures), columns)]
-    return np.vstack(rows)
+    across = min(4, opened)
+    pictures += [np.full_like(pictures[0], 255)] * (-opened % across)
+    return np.vstack([np.hstack(pictures[k : k + across]) for k in range(0, len(pictures), across)])
 
 
 def save_film(
@@ -203,10 +215,14 @@ def _write_mp4(path: Path, film: Film, seconds: float, progress: Callable[[], ob
     options: dict[str, Any] = {"fps": RATE, "codec": "libx264", "macro_block_size": 2}
     film_writer: Any = imageio.get_writer(path, format="FFMPEG", mode="I", **options)
     with film_writer as writer:
+        written = 0
         for step, frame in enumerate(_counted(film, progress)):
-            shown = LAST_SECONDS if step == len(film) - 1 else seconds
-            for _ in range(max(1, round(RATE * shown))):
+            # The sum is rounded, not each frame, so that a film has the right length.
+            end = LAST_SECONDS if step == len(film) - 1 else seconds
+            end = round(RATE * (step * seconds + end))
+            while written < end:
                 writer.append_data(_even(frame))
+                written += 1
 
 
 def _even(frame: Frame) -> Frame:

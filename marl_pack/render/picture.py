@@ -8,6 +8,7 @@ or any other global state, so pictures can be drawn in any thread or process.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -24,11 +25,17 @@ from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from marl_pack.files import moved_into_place
+from marl_pack.geometry.rotated import inner_sides
 from marl_pack.plan import Plan
 from marl_pack.render.colours import PALETTE
 
 LEGAL = "#18a558"
 """Colour of the cells where the item may be placed."""
+
+ENOUGH = 1000
+"""Parts of a bin's longest side that rotated boxes need."""
+FINEST = 1e-6
+"""Share of a bin's longest side to which lengths are rounded."""
 
 _INK, _FAINT, _BARRED = "#202020", "#909090", "#c0392b"
 
@@ -111,7 +118,10 @@ def paint_order(boxes: NDArray[np.integer]) -> list[tuple[int, int]]:
         while waiting.any():
             following = waiting & ~hides[:, waiting].any(1)
             if not following.any():
-                raise ValueError(f"some of boxes {np.flatnonzero(waiting).tolist()} overlap")
+                raise ValueError(
+                    f"boxes overlap, some of {np.flatnonzero(waiting).tolist()}: a picture needs "
+                    "boxes that do not"
+                )
             paint = following & (stands | hides[:, painted].any(1))
             order.extend((i, level) for i in np.flatnonzero(paint).tolist())
             painted |= paint
@@ -125,28 +135,40 @@ class Drawable:
 
     size: tuple[int, int, int]
     boxes: NDArray[np.int64]  # [n, 6]
-    parts: int  # the numbers are this many times the plan's
+    parts: float  # the numbers are this many times the plan's
 
 
 def drawable(plan: Plan) -> Drawable:
-    """Return a plan of one bin in whole numbers; a box with a yaw is drawn without it, smaller.
+    """Return a plan of one bin in whole numbers.
+
+    A box with a yaw becomes a large box without it inside. Lengths of more than four decimals are
+    rounded to :data:`FINEST` of the bin's longest side.
 
     Raises:
-        ValueError: for a plan of several bins, or lengths of more than four decimals.
+        ValueError: for a plan of several bins.
     """
     if len(plan.bin_sizes) != 1:
         raise ValueError(f"a plan of {len(plan.bin_sizes)} bins: needs one, plan.in_bin(k)")
     boxes, size = plan.boxes.astype(np.float64), plan.bin_sizes[0].astype(np.float64)
-    turned = plan.yaws != 0
-    around = (plan.extents[1] - plan.extents[0])[turned, :2] - boxes[turned, 3:5]
-    boxes[turned, :2] = np.ceil(boxes[turned, :2] + around / 2)
-    boxes[turned, 3:5] = np.floor(boxes[turned, 3:5] - around - 1)
-    for parts in (1, 10, 100, 1000, 10_000):
-        whole, whole_size = np.round(boxes * parts), np.round(size * parts)
-        if np.allclose(whole, boxes * parts, atol=1e-6) and (whole_size == size * parts).all():
-            w, d, h = whole_size.astype(int).tolist()
-            return Drawable((w, d, h), whole.astype(np.int64), parts)
-    raise ValueError("a picture needs lengths of at most four decimals")
+    finest = 1.0 / (FINEST * size.max())
+    for parts in (1.0, 10.0, 100.0, 1000.0, 10_000.0, finest):
+        whole_size = np.round(size * parts)
+        straight = np.vstack((boxes[plan.yaws == 0, :3], boxes[plan.yaws == 0, 3:], size)) * parts
+        exact = np.allclose(np.round(straight), straight, rtol=0, atol=1e-6)
+        if exact and (not plan.yaws.any() or parts * size.max() >= ENOUGH):
+            break
+    whole = np.hstack((boxes[:, :3], boxes[:, :3] + boxes[:, 3:])) * parts  # low, high
+    for i in np.flatnonzero(plan.yaws):
+        angle = math.radians(abs(float(plan.yaws[i])))
+        w, d = boxes[i, 3:5].tolist()
+        inside = inner_sides(w, d, math.cos(angle), math.sin(angle))
+        middle = boxes[i, :2] + boxes[i, 3:5] / 2
+        whole[i, :2] = np.ceil((middle - np.array(inside) / 2) * parts)
+        whole[i, 3:5] = np.floor((middle + np.array(inside) / 2) * parts)
+    whole = np.clip(np.round(whole), 0, np.tile(whole_size, 2))
+    whole[:, 3:] = np.maximum(whole[:, 3:] - whole[:, :3], 1)
+    width, depth, height = whole_size.astype(int).tolist()
+    return Drawable((width, depth, height), whole.astype(np.int64), parts)
 
 
 def draw_plan(
@@ -171,7 +193,7 @@ def draw(
     title: str = "",
     pixels: tuple[int, int] = (960, 600),
     leave_space: bool = False,
-    parts: int = 1,
+    parts: float = 1,
     colours: Sequence[str] = PALETTE,
 ) -> NDArray[np.uint8]:
     """Draw, from left to right, the item to come, the bin, and where the item may be placed.
@@ -279,7 +301,7 @@ def _draw_bin(
     rect: _Rect,
     size: tuple[int, int, int],
     boxes: NDArray[np.int64],
-    parts: int,
+    parts: float,
     colours: Sequence[str],
 ) -> float:
     """Draw the bin in 3D so that it fills ``rect``, and return its scale in pixels per cell."""
@@ -324,7 +346,7 @@ def _draw_item(
     item: tuple[int, int, int],
     colour: str,
     scale: float,
-    parts: int,
+    parts: float,
 ) -> None:
     """Draw the item to come in the middle of ``rect``, with its sides below."""
     axes, own_scale = _axes(figure, rect, item, scale)

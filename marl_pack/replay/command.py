@@ -54,7 +54,8 @@ def parser(program: str = PROGRAM) -> Parser:
         help="number of boxes on a picture (default: all)")  # fmt: skip
     add("--seconds", type=float, metavar="S",
         help="how long a film shows each box (default: 0.6)")  # fmt: skip
-    add("--pixels", type=int, nargs=2, metavar=("W", "H"), help="size (default: 720 480)")
+    add("--pixels", type=int, nargs=2, metavar=("W", "H"),
+        help="size of a film, or of the picture of each bin (default: 720 480)")  # fmt: skip
     add("--colour", choices=COLOURINGS, help="what colours show (default: item)")
     return options
 
@@ -97,7 +98,8 @@ def choose_plan(chosen: argparse.Namespace) -> Plan:
     plans = load_plans(chosen.plan)
     episode = 0 if chosen.episode is None else chosen.episode
     if not 0 <= episode < len(plans):
-        raise ValueError(f"--episode {episode}: needs a number from 0 to {len(plans) - 1}")
+        most = f" … {len(plans) - 1}" if len(plans) > 1 else ", the only plan of the file"
+        raise ValueError(f"--episode {episode}: needs 0{most}")
     return plans[episode]
 
 
@@ -123,8 +125,12 @@ def write_picture(chosen: argparse.Namespace, plan: Plan, title: str, console: C
         ValueError: if an option does not go with the plan.
     """
     from marl_pack.render.animation import PIXELS, SECONDS, Film, save_film
+    from marl_pack.render.colours import colour_plan
 
-    film = Film(plan, title, tuple(chosen.pixels or PIXELS), chosen.colour or "item")
+    colour = chosen.colour or "item"
+    if colour_plan(plan, colour) is None:
+        raise ValueError(f"--colour {colour}: the plan has no such values, or only one")
+    film = Film(plan, title, tuple(chosen.pixels or PIXELS), colour)
     if chosen.step is not None:
         whole_number(chosen.step, "--step", 0, len(plan))
     with make_progress(console) as bar:
@@ -146,11 +152,17 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     check(chosen)
     plan = choose_plan(chosen)
     title = chosen.plan.stem if chosen.title is None else chosen.title
+    title = title.encode(errors="replace").decode()  # names of files may have other bytes
     if chosen.out.suffix.lower() == PAGE:
         write_page(chosen.out, plan, title)
     else:
-        write_picture(chosen, plan, title, console)
-    console.print(f"{len(plan)} boxes, {plan.utilization:.1%} filled: {chosen.out}", soft_wrap=True)
+        try:
+            write_picture(chosen, plan, title, console)
+        except ValueError as error:
+            named = str(error).startswith("--")
+            raise ValueError(str(error) if named else f"{chosen.plan}: {error}") from None
+    boxes = "1 box" if len(plan) == 1 else f"{len(plan)} boxes"
+    console.print(f"{boxes}, {plan.utilization:.1%} filled: {chosen.out}", soft_wrap=True)
     if chosen.open:
         open_page(chosen.out, console)
 

@@ -158,7 +158,8 @@ def make_router(service: Service) -> APIRouter:
         """Return the content of the replay page; the bin may change meanwhile."""
         from marl_pack.replay.document import make_document
 
-        return await run_in_threadpool(make_document, await service.read(id, _plan), title=id)
+        plan, closed = await service.read(id, lambda bin, packer: (packer.plan, bin.closed))
+        return {**await run_in_threadpool(make_document, plan, title=id), "closed": closed}
 
     @router.get(
         "/bins/{id}/replay", tags=["results"], summary="A page that shows the bin being packed",

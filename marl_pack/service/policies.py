@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from marl_pack import published, renamed
 from marl_pack.checks import shown
-from marl_pack.exact.explaining import Explained, Reasons
+from marl_pack.exact.explaining import Reasons
 from marl_pack.exact.search_settings import ExactSearchSettings
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.packer.policies import (
@@ -42,11 +42,12 @@ class _OneAtATime:
 
         It computes it again, as other bins may have asked it since.
         """
-        if not isinstance(self.policy, Explained):
+        if not hasattr(self.policy, "reasons"):
             return Reasons()
         with self.lock:
             self.policy(turn)
-            return self.policy.reasons(turn, g, moves, move)
+            reasons: Reasons = self.policy.reasons(turn, g, moves, move)
+            return reasons
 
 
 class Policies:

@@ -1,5 +1,6 @@
 """The replay page in a real browser: every control is used; the values are those of the plan."""
 
+import html
 import http.server
 import json
 import re
@@ -246,6 +247,129 @@ def test_a_click_keeps_the_values_of_a_box(open_page, orders) -> None:
     assert page.evaluate("page.selected") == -1
 
 
+def test_values_follow_the_step_and_the_bin(open_page, orders) -> None:
+    plan, url = orders
+    page = open_page(f"{url}#bin=0&step=6")
+    area = page.locator("#view").bounding_box()
+    lower = next(i for i in range(6) if load_on(plan, i, 6) != load_on(plan, i, len(plan)))
+    x, y = page.evaluate(
+        f"(() => {{ for (let dy = -60; dy < 60; dy += 3) for (let dx = -60; dx < 60; dx += 3) {{"
+        f" const [x, y] = page.view.project({lower});"
+        f" if (page.view.pick(x + dx, y + dy) === {lower}) return [x + dx, y + dy]; }} }})()"
+    )
+    page.mouse.move(area["x"] + x, area["y"] + y)
+    for count in (6, len(plan)):
+        page.evaluate(f"page.goTo({count})")
+        shown = numbers(text(page, "#tooltip dd[data-key=load]"))
+        assert shown[0] == pytest.approx(load_on(plan, lower, count))
+    page.keyboard.press("Home")
+    assert not page.locator("#tooltip").is_visible()
+    page.keyboard.press("End")
+    page.mouse.move(area["x"] + 3, area["y"] + 3)
+    row = page.locator("#best tbody tr").first
+    row.hover()  # a placement in bin 1, while bin 0 is shown: no outline
+    assert page.evaluate("page.view.ghost.geometry.drawRange.count") == 0
+    page.select_option("#bin", "1")
+    page.locator("#best tbody tr").nth(1).hover()
+    assert page.evaluate("page.view.ghost.geometry.drawRange.count") == 24
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("page.view.ghost.geometry.drawRange.count") == 0
+    page.locator("details summary").click()
+    page.locator("#boxes tbody button").first.click()
+    assert page.locator("#bin").input_value() == "0"  # the box that was chosen is there
+
+
+def test_the_memory_of_the_view_does_not_grow(open_page, orders) -> None:
+    page = open_page(orders[1])
+    use = (
+        "(() => { const { geometries, textures } = page.view.renderer.info.memory;"
+        " return [geometries, textures]; })()"
+    )
+    counts = []
+    for _ in range(2):
+        for _ in range(10):
+            page.evaluate("page.next(document.getElementById('bin'))")
+            page.evaluate("page.update(page.model.doc, false)")
+            picture(page)
+        counts.append(page.evaluate(use))
+    assert counts[0] == counts[1]
+
+
+def test_a_change_keeps_the_selected_box_and_the_focus(open_page, orders) -> None:
+    page = open_page(orders[1])
+    page.locator("details summary").click()
+    page.locator("#boxes tbody button").nth(3).click()
+    page.evaluate("page.update(JSON.parse(JSON.stringify(page.model.doc)), false)")
+    assert page.evaluate("page.selected") == 3
+    assert page.evaluate("document.activeElement.textContent").startswith("4 ")
+    page.evaluate(
+        "(() => { const doc = JSON.parse(JSON.stringify(page.model.doc));"
+        " doc.boxes[3].id = 'other'; page.update(doc, false); })()"
+    )
+    assert page.evaluate("page.selected") == -1
+
+
+def test_what_scrolls_keeps_its_keys(open_page, pallet) -> None:
+    page = open_page(f"{pallet[1]}#step=20")
+    page.locator("aside").focus()
+    for key in ("End", "Home", " "):
+        page.keyboard.press(key)
+    assert step(page) == 20
+    assert not page.evaluate("page.playing")
+    page.keyboard.press("c")
+    assert page.locator("#colour").input_value() == "weight"
+
+
+def test_a_choice_of_shading_stays(open_page, tmp_path) -> None:
+    packer = Packer((1200, 800, 1000), "rs", explain=True)
+    for case in draw_cases(5, seed=1):
+        packer.place(case["sides"])
+    page = open_page(write(tmp_path / "rs.html", packer.plan, "rs"))
+    page.select_option("#map-shade", "probabilities")
+    page.click("#back")
+    page.click("#theme")
+    assert page.locator("#map-shade").input_value() == "probabilities"
+
+
+def test_the_address_says_what_is_shown_and_can_be_changed(open_page, pallet) -> None:
+    page = open_page(f"{pallet[1]}#step=nonsense&colour=none&bin=9")
+    assert step(page) == len(pallet[0])
+    page.evaluate("location.hash = '#step=9&colour=margin'")
+    until(page, "page.step === 9")
+    assert page.locator("#colour").input_value() == "margin"
+    page.click("#forward")
+    until(page, "location.hash.includes('step=10')")
+
+
+def test_the_page_works_inside_another_one(open_page, pallet, tmp_path) -> None:
+    outer = tmp_path / "outer.html"
+    content = html.escape(Path(pallet[1].removeprefix("file://")).read_text(encoding="utf-8"))
+    outer.write_text(
+        "<script>window.page = {model: 1}</script>"
+        f'<iframe width=1000 height=600 srcdoc="{content}"></iframe>',
+        encoding="utf-8",
+    )
+    page = open_page(outer.as_uri())
+    frame = page.frames[1]
+    frame.click("#first")
+    frame.click("#forward")
+    page.wait_for_timeout(600)
+    assert frame.evaluate("page.step") == 1
+
+
+def test_long_names_do_not_break_the_page(open_page, tmp_path) -> None:
+    packer = Packer((600, 400, 400), bins=3)
+    for order in ("n" * 150, "s" * 150):
+        for k in range(3):
+            packer.place((200, 200, 200), id="i" * 190 + str(k), order=order)
+    page = open_page(write(tmp_path / "long.html", packer.plan, "t" * 400))
+    wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide <= inner
+    page.click("#back")
+    assert page.locator("#conveyor figure").first.bounding_box()["width"] < 150
+    assert page.locator("#slider").bounding_box()["width"] > 250
+
+
 def test_bins_orders_and_boxes_without_a_place_are_shown(open_page, orders) -> None:
     plan, url = orders
     page = open_page(url)
@@ -287,7 +411,7 @@ def test_the_page_says_why_a_box_is_where_it_is(open_page, pallet, tmp_path, log
     plan, url = pallet
     page = open_page(f"{url}#step=20")
     why = plan.explanations[19]
-    assert f"{why.legal} legal placements" in text(page, "#why-summary")
+    assert f"{why.legal} legal candidates" in text(page, "#why-summary")
     first = page.locator("#best tbody tr").first.locator("td").all_inner_texts()
     assert [float(v.replace(",", "")) for v in first[0].split(", ")] == why.positions[
         why.chosen
@@ -314,7 +438,7 @@ def test_agents_show_their_probabilities(open_page, tmp_path, log) -> None:
     assert shown == pytest.approx(why.orientation_probabilities.tolist(), abs=6e-4)
     assert page.locator("#map-shade option").all_inner_texts() == [
         "afterstate value",
-        "probability",
+        "probability of the cell",
     ]
     before = page.locator("#map").screenshot()
     page.select_option("#map-shade", "probabilities")
@@ -433,10 +557,15 @@ def test_the_service_shows_a_bin_while_it_is_packed(open_page, tmp_path, log) ->
             until(page, f"page.step === {k + 1}")
             shown = numbers(text(page, "#box dd[data-key=position]"))
             assert shown == [answer["x"], answer["y"], answer["z"]]
-            assert "legal placements" in text(page, "#why-summary")
+            assert "legal candidates" in text(page, "#why-summary")
         log(f"service: {text(page, '#caption')}, {text(page, '#live')}")
         httpx.post(f"{bin_url}/undo")
         until(page, "page.step === 2")
+        httpx.post(f"{bin_url}/actual", json={"x": 900, "y": 500, "yaw": 4})
+        until(page, "page.why.moved")
+        assert "reported at another place than planned" in text(page, "#why-summary")
+        httpx.post(f"{bin_url}/close")
+        until(page, "document.getElementById('live').textContent === 'closed'")
         page.close()
 
 

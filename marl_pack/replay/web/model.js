@@ -8,6 +8,11 @@ function plain(value, digits = 2) {
   return Number(value.toFixed(digits)).toLocaleString("en", { maximumFractionDigits: digits });
 }
 
+/** A text with at most so many characters. */
+function short(text, most) {
+  return text.length <= most ? text : `${text.slice(0, most - 1)}…`;
+}
+
 function percent(share, digits = 0) {
   return `${(100 * share).toFixed(digits)} %`;
 }
@@ -24,6 +29,8 @@ class Model {
     this.carries = this.boxes.map(() => []);
     this.restsOn.forEach((below, i) => below.forEach((j) => this.carries[j].push(i)));
     this.orderNames = [...new Set(this.orders)];
+    const longest = Math.max(...this.bins.flat());
+    this.digits = Math.min(20, Math.max(1, 4 - Math.floor(Math.log10(longest))));
   }
 
   get last() {
@@ -98,24 +105,25 @@ class Model {
     return ["w", "d", "h"].map((side) => placed[order.indexOf(side)]);
   }
 
+  /** A length with digits that suit the size of the bins. */
   length(value) {
-    return plain(value, this.unit === "cells" ? 3 : 1);
+    return plain(value, this.digits);
   }
 
   /** The values of a box at a step: rows of key, label, text and whether it is bad. */
   values(i, step) {
     const box = this.boxes[i];
     const rows = [
-      ["id", "Id", box.id || "–"],
+      ["id", "Id", short(box.id || "–", 200)],
       ["size", "Size", `${[box.w, box.d, box.h].map((v) => this.length(v)).join(" × ")} ${this.unit}`],
       ["position", "Position", `${[box.x, box.y, box.z].map((v) => this.length(v)).join(", ")} ${this.unit}`],
     ];
     if (this.bins.length > 1) rows.push(["bin", "Bin", `${box.bin + 1}`]);
-    if (this.orderNames.length > 1) rows.push(["order", "Order", this.orders[box.bin]]);
+    if (this.orderNames.length > 1) rows.push(["order", "Order", short(this.orders[box.bin], 200)]);
     if (box.orientation >= 0) rows.push(["orientation", "Orientation", `${SIDES_IN_ORDER[box.orientation]}`]);
     if (box.yaw) rows.push(["yaw", "Yaw", `${plain(box.yaw)}°`]);
     rows.push(["support", "Support", percent(box.support, 1)]);
-    if (box.margin !== undefined) rows.push(["margin", "Margin", `${plain(box.margin, 1)} ${this.unit}`, box.margin < 0]);
+    if (box.margin !== undefined) rows.push(["margin", "Margin", `${this.length(box.margin)} ${this.unit}`, box.margin < 0]);
     const kilograms = this.doc.unit_mm === null ? "" : " kg";
     rows.push(["weight", "Weight", `${plain(box.weight)}${kilograms}${box.weight_assumed ? " (assumed)" : ""}`]);
     const load = this.load(i, step);

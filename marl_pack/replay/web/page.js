@@ -14,12 +14,8 @@ class Page {
     this.hovered = -1;
     this.why = new WhyPanel((placement) => this.view?.showGhost(placement));
     this.load(doc);
-    const asked = new URLSearchParams(location.hash.slice(1));
-    this.goTo(asked.has("step") ? Number(asked.get("step")) : this.model.last);
-    for (const id of ["colour", "bin"]) {
-      const known = [...$(id).options].some((option) => option.value === asked.get(id));
-      if (known) $(id).value = asked.get(id);
-    }
+    this.step = this.model.last;
+    this.readAddress();
     this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
     this.openView();
     this.listen();
@@ -28,16 +24,29 @@ class Page {
     if (live) this.follow(live);
   }
 
+  /** Show a document that has changed; who looks at the last step follows it. */
+  update(doc, drop) {
+    const atEnd = this.step === this.model.last && !this.playing;
+    const same = (i) => i >= 0 && JSON.stringify(doc.boxes[i]) === JSON.stringify(this.model.boxes[i]);
+    if (!same(this.selected)) this.selected = -1;
+    const focused = [...$("boxes").querySelectorAll("button")].indexOf(document.activeElement);
+    this.load(doc);
+    if (focused >= 0) $("boxes").querySelectorAll("button")[focused]?.focus();
+    this.view?.setModel(this.model);
+    this.setTheme(document.documentElement.dataset.theme);
+    this.goTo(atEnd ? this.model.last : this.step, drop && atEnd);
+  }
+
   /** Take a new document. */
   load(doc) {
     this.model = new Model(doc);
     document.title = doc.title || "Replay";
-    $("title").textContent = doc.title || "Replay";
+    $("title").textContent = short(doc.title || "Replay", 120);
     $("slider").max = this.model.last;
     const [colour, bin] = [$("colour").value, $("bin").value];
     const colourings = this.model.colourings;
     options($("colour"), colourings.map((name) => [name, name]), colourings.includes(colour) ? colour : "item");
-    const bins = this.model.bins.map((_, k) => [k, this.model.orders[k] ? `${k + 1}: ${this.model.orders[k]}` : `${k + 1}`]);
+    const bins = this.model.bins.map((_, k) => [k, [k + 1, ...(this.model.orders[k] ? [short(this.model.orders[k], 40)] : [])].join(": ")]);
     const many = bins.length > 1;
     options($("bin"), many ? [["open", "open one"], ["all", "all"], ...bins] : [["all", "all"]], many ? bin || "open" : "all");
     if ($("bin").selectedIndex < 0) $("bin").selectedIndex = 0;
@@ -45,10 +54,10 @@ class Page {
     const left = doc.left_out ?? [];
     $("left-out").hidden = !left.length;
     $("left-out").querySelector("ul").replaceChildren(...left.map((box) =>
-      element("li", `${box.id || "box"} (${[box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × ")}): ${box.reason}`)));
+      element("li", `${short(box.id || "box", 60)} (${[box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × ")}): ${box.reason}`)));
     fillTable($("boxes"), ["box", "size", "position", "kg"], this.model.boxes.map((box, i) => ({
       cells: [
-        `${i + 1} ${box.id}`, [box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × "),
+        `${i + 1} ${short(box.id, 40)}`, [box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × "),
         [box.x, box.y, box.z].map((v) => this.model.length(v)).join(", "), plain(box.weight),
       ],
       press: () => {
@@ -93,6 +102,7 @@ class Page {
 
   show(drop = false) {
     const { model, step } = this;
+    this.view?.showGhost(null);
     $("slider").value = step;
     $("slider").setAttribute("aria-valuetext", model.caption(step));
     $("caption").textContent = model.caption(step);
@@ -110,13 +120,40 @@ class Page {
     const kilograms = model.doc.unit_mm === null ? "weight" : "kg";
     fillTable($("bins"), ["bin", "boxes", "filled", "top", kilograms], rows.map((row, k) => ({
       cells: [
-        model.orders[k] ? `${k + 1} (${model.orders[k]})` : `${k + 1}`, `${row.boxes}`,
+        model.orders[k] ? `${k + 1} (${short(model.orders[k], 40)})` : `${k + 1}`, `${row.boxes}`,
         percent(row.utilization, 1), model.length(row.top), plain(row.weight, 1),
       ],
       chosen: rows.length > 1 && k === model.openBin(step),
     })));
     this.showSubject();
-    history.replaceState(null, "", `#${new URLSearchParams({ step, colour: $("colour").value, bin: $("bin").value })}`);
+    const seen = this.view?.visible.includes(this.hovered);
+    if (this.hovered >= 0 && seen) this.fillTooltip();
+    else this.hover(-1);
+    this.keepAddress();
+  }
+
+  /** Write what is shown into the address once the user rests: browsers limit how often this may be done. */
+  keepAddress() {
+    clearTimeout(this.addressTimer);
+    this.addressTimer = setTimeout(() => {
+      const shown = { step: this.step, colour: $("colour").value, bin: $("bin").value };
+      try {
+        history.replaceState(null, "", `#${new URLSearchParams(shown)}`);
+      } catch (error) {
+        console.warn(error); // a page inside another one has no address
+      }
+    }, 400);
+  }
+
+  /** Show what the address asks for; nonsense in it changes nothing. */
+  readAddress() {
+    const asked = new URLSearchParams(location.hash.slice(1));
+    for (const id of ["colour", "bin"]) {
+      const known = [...$(id).options].some((option) => option.value === asked.get(id));
+      if (known) $(id).value = asked.get(id);
+    }
+    if (asked.has("step") && Number.isFinite(Number(asked.get("step")))) this.step = Number(asked.get("step"));
+    this.goTo(this.step);
   }
 
   showSubject() {
@@ -129,7 +166,11 @@ class Page {
 
   select(i) {
     this.selected = i < this.step ? i : -1;
-    this.showSubject();
+    const { bin } = this;
+    if (this.selected >= 0 && bin !== null && this.model.boxes[i].bin !== bin) {
+      $("bin").value = this.model.boxes[i].bin;
+      this.show();
+    } else this.showSubject();
   }
 
   showLegend() {
@@ -141,14 +182,15 @@ class Page {
     names.slice(0, NAMED).forEach((name, k) => {
       const swatch = element("span", "", "swatch");
       swatch.style.background = model.doc.palette[k % model.doc.palette.length];
-      legend.append(swatch, name);
+      legend.append(swatch, short(name, 40));
     });
     if (names.length > NAMED) legend.append(` + ${names.length - NAMED} more`);
     if (range) {
       const unit = colouring === "margin" ? ` ${model.unit}` : model.doc.unit_mm === null ? "" : " kg";
       const scale = element("span", "", "scale");
       scale.style.background = `linear-gradient(90deg, ${model.doc.scale.join(", ")})`;
-      legend.append(`${colouring} ${plain(range[0], 1)} `, scale, ` ${plain(range[1], 1)}${unit}`);
+      const digits = colouring === "margin" ? model.digits : 2;
+      legend.append(`${colouring} ${plain(range[0], digits)} `, scale, ` ${plain(range[1], digits)}${unit}`);
     }
   }
 
@@ -160,8 +202,8 @@ class Page {
       const figure = element("figure", "", k === 0 ? "next" : "");
       const sides = this.model.ownSides(box);
       figure.append(boxPicture(sides, longest, this.model.colour(this.step + k, $("colour").value)));
-      figure.append(element("figcaption", box.id || sides.map((v) => this.model.length(v)).join("×")));
-      figure.title = `${box.id} ${sides.map((v) => this.model.length(v)).join(" × ")} ${this.model.unit}`;
+      figure.append(element("figcaption", short(box.id, 14) || sides.map((v) => this.model.length(v)).join("×")));
+      figure.title = `${short(box.id, 200)} ${sides.map((v) => this.model.length(v)).join(" × ")} ${this.model.unit}`;
       return figure;
     }));
     const rest = this.model.last - this.step - coming.length;
@@ -221,6 +263,7 @@ class Page {
     $("slider").addEventListener("input", () => stepTo(Number($("slider").value)));
     for (const id of ["colour", "bin"]) $(id).addEventListener("change", () => this.show());
     $("reset").addEventListener("click", () => this.view?.reset());
+    window.addEventListener("hashchange", () => this.readAddress());
     $("theme").addEventListener("click", () => this.toggleTheme());
     $("help").addEventListener("click", () => $("keys").showModal());
     const keys = {
@@ -234,7 +277,8 @@ class Page {
       t: () => this.toggleTheme(), "?": () => $("keys").showModal(), Escape: () => this.select(-1),
     };
     document.addEventListener("keydown", (event) => {
-      const inside = event.target.closest("input, select, button, summary, dialog");
+      // Keys that move a control, or scroll what has the focus, keep their meaning there.
+      const inside = event.target.closest("input, select, button, summary, dialog, aside, #conveyor");
       const own = inside && (event.key.length > 1 || event.key === " " || inside.matches("select, dialog"));
       if (event.ctrlKey || event.metaKey || event.altKey || (own && event.key !== "Escape") || $("keys").open) return;
       if (!Object.hasOwn(keys, event.key)) return;
@@ -263,11 +307,7 @@ class Page {
     const tooltip = $("tooltip");
     tooltip.hidden = i < 0;
     if (i >= 0) {
-      if (i !== this.hovered) {
-        const list = document.createElement("dl");
-        list.append(...valueList(this.model.values(i, this.step)));
-        tooltip.replaceChildren(list);
-      }
+      if (i !== this.hovered) this.fillTooltip(i);
       const stage = $("stage").getBoundingClientRect();
       tooltip.style.left = `${Math.max(4, Math.min(x + 14, stage.width - tooltip.offsetWidth - 4))}px`;
       tooltip.style.top = `${Math.max(4, Math.min(y + 14, stage.height - tooltip.offsetHeight - 4))}px`;
@@ -275,6 +315,12 @@ class Page {
     if (i === this.hovered) return;
     this.hovered = i;
     this.showSubject();
+  }
+
+  fillTooltip(i = this.hovered) {
+    const list = document.createElement("dl");
+    list.append(...valueList(this.model.values(i, this.step)));
+    $("tooltip").replaceChildren(list);
   }
 
   /** Ask again and again for a plan that still grows. */
@@ -289,13 +335,13 @@ class Page {
         $("live").textContent = "live";
         $("live").classList.remove("lost");
         if (text !== before) {
-          const atEnd = this.step === this.model.last;
           const grown = before !== "";
           before = text;
-          this.load(JSON.parse(text));
-          this.view?.setModel(this.model);
-          this.setTheme(document.documentElement.dataset.theme);
-          this.goTo(atEnd && !this.playing ? this.model.last : this.step, grown && atEnd);
+          this.update(JSON.parse(text), grown);
+          if (this.model.doc.closed) {
+            $("live").textContent = "closed";
+            return;
+          }
         }
       } catch (error) {
         console.warn(error);

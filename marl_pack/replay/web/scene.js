@@ -29,16 +29,22 @@ class View3D {
     this.reset();
   }
 
+  /** Take things out of the scene and free their memory. */
+  discard(...parts) {
+    for (const part of parts.filter(Boolean)) {
+      this.scene.remove(part);
+      part.geometry?.dispose();
+      part.material.map?.dispose();
+      part.material.dispose();
+      part.dispose?.();
+    }
+  }
+
   /** Show another plan; the view stays if the bins are the same. */
   setModel(model) {
     this.moved &&= JSON.stringify(model.bins) === JSON.stringify(this.model.bins);
-    for (const part of [this.mesh, this.edges, this.outline, this.ghost, this.frames]) {
-      if (part) {
-        this.scene.remove(part);
-        part.geometry?.dispose();
-      }
-    }
-    this.labels?.forEach((label) => this.scene.remove(label));
+    this.discard(this.mesh, this.edges, this.outline, this.ghost, this.frames, ...(this.labels ?? []));
+    [this.frames, this.labels] = [null, []];
     this.model = model;
     const count = Math.max(1, model.last);
     this.unit = Math.max(...model.bins.flat()) / 10;
@@ -82,12 +88,8 @@ class View3D {
     if (this.bin !== undefined) this.moved = false; // other bins are elsewhere
     this.bin = bin;
     this.shown = this.model.bins.map((_, k) => k).filter((k) => bin === null || k === bin);
-    if (this.frames) {
-      this.scene.remove(this.frames);
-      this.frames.geometry.dispose();
-    }
+    this.discard(this.frames, ...this.labels);
     this.frames = this.lines(this.shown.length, 1);
-    this.labels?.forEach((label) => this.scene.remove(label));
     this.labels = [];
     this.shown.forEach((k, row) => {
       const [w, d, h] = this.model.bins[k].map((side) => side / this.unit);
@@ -221,6 +223,7 @@ class View3D {
 
   /** Outline a placement that was not chosen: {bin, x, y, z, w, d, h}; null for none. */
   showGhost(placement) {
+    if (placement && !this.shown.includes(placement.bin)) placement = null;
     if (placement) {
       const { low, sides } = this.place(placement);
       this.writeEdges(this.ghost, 0, low, sides, 0);
@@ -272,6 +275,8 @@ class View3D {
     }
     this.controls.target.copy(middle);
     this.camera.position.copy(middle).addScaledVector(away, distance);
+    this.controls.minDistance = distance / 20;
+    this.controls.maxDistance = distance * 5;
     this.camera.near = distance / 100;
     this.camera.far = distance * 10;
     this.camera.updateProjectionMatrix();

@@ -27,9 +27,17 @@ class WhyPanel {
     if (!why) return;
     const box = model.boxes[i];
     const listed = why.placements.x.length;
-    const words = [`${model.name(i)}: ${plain(why.legal)} legal placement${why.legal === 1 ? "" : "s"}`];
-    if (listed < why.legal) words.push(`the best ${plain(listed)} are listed`);
-    this.parts["why-summary"].textContent = `${words.join("; ")}.`;
+    const ranked = why.values || why.probabilities;
+    const kind = model.unit === "mm" ? "candidate" : "placement";
+    const words = [why.legal === 1 ? `the only legal ${kind}` : `${plain(why.legal)} legal ${kind}s`];
+    if (listed < why.legal) words.push(`${ranked ? "the best " : ""}${plain(listed)} of them are listed`);
+    const chosen = why.chosen < 0 ? null : this.placement(why.chosen);
+    this.planned = chosen ?? box;
+    const away = chosen && Math.max(...["x", "y", "z"].map((axis) => Math.abs(chosen[axis] - box[axis])));
+    const unit = Math.max(...model.bins[box.bin]) * 1e-6;
+    this.moved = (box.yaw ?? 0) !== 0 || away > unit;
+    if (this.moved) words.push("the box was reported at another place than planned; this is about the planned one");
+    this.parts["why-summary"].textContent = `${short(model.name(i), 60)}: ${words.join("; ")}.`;
     this.showOrientations(box.orientation);
     this.fillSelects(box.orientation);
     this.showBest();
@@ -62,8 +70,11 @@ class WhyPanel {
     );
     const shades = [];
     if (this.why.values) shades.push(["values", this.why.value_of || "value"]);
-    if (this.why.probabilities) shades.push(["probabilities", "probability"]);
-    options(this.parts["map-shade"], shades.length ? shades : [["", "legal or not"]], shades[0]?.[0] ?? "");
+    const cell = this.why.probability_of === "cell" ? " of the cell" : "";
+    if (this.why.probabilities) shades.push(["probabilities", `probability${cell}`]);
+    const before = this.parts["map-shade"].value;
+    const kept = shades.some(([key]) => key === before) ? before : shades[0]?.[0];
+    options(this.parts["map-shade"], shades.length ? shades : [["", "legal or not"]], kept ?? "");
   }
 
   /** The sides of the box along x, y, z in an orientation. */
@@ -81,23 +92,29 @@ class WhyPanel {
 
   /** A table of the best placements by value, or else by probability. */
   showBest() {
-    const { values, probabilities, placements, chosen } = this.why;
+    const { values, probabilities, placements, chosen, tries } = this.why;
     const { best } = this.parts;
     const ranks = values ?? probabilities;
     best.hidden = !ranks;
     if (!ranks) return;
     const known = ranks.map((_, m) => m).filter((m) => ranks[m] !== null);
-    known.sort((a, b) => ranks[b] - ranks[a] || (b === chosen) - (a === chosen));
+    // A mean of few futures says little, so the placements that were tried most often come first.
+    const often = (m) => tries?.[m] ?? 0;
+    known.sort((a, b) => often(b) - often(a) || ranks[b] - ranks[a] || (b === chosen) - (a === chosen));
     const rows = known.slice(0, BEST);
     if (chosen >= 0 && !rows.includes(chosen)) rows.push(chosen);
     best.caption.textContent = values ? `Best placements by ${this.why.value_of || "value"}` : "Most probable placements";
-    const heads = ["x, y, z", "sides", ...(values ? ["value"] : []), ...(probabilities ? ["prob."] : [])];
+    const heads = ["x, y, z", "sides"];
+    if (values) heads.push("value");
+    if (tries) heads.push("futures");
+    if (probabilities) heads.push(this.why.probability_of === "cell" ? "prob. of cell" : "prob.");
     fillTable(best, heads, rows.map((m) => {
       const at = ["x", "y", "z"].map((axis) => this.model.length(placements[axis][m])).join(", ");
       const cells = [at, SIDES_IN_ORDER[placements.orientation[m]]];
-      for (const numbers of [values, probabilities]) {
-        if (numbers) cells.push(numbers[m] === null ? "–" : plain(numbers[m], 4));
-      }
+      const number = (value) => (value === null ? "–" : plain(value, 4));
+      if (values) cells.push(number(values[m]));
+      if (tries) cells.push(`${tries[m]}`);
+      if (probabilities) cells.push(number(probabilities[m]));
       return { cells, chosen: m === chosen, look: (on) => this.onGhost(on ? this.placement(m) : null) };
     }));
   }
@@ -133,8 +150,13 @@ class WhyPanel {
     pen.fillRect(...rectangle(0, 0, width, depth));
     pen.lineWidth = 2;
     pen.strokeStyle = colour("--line");
-    for (const box of this.model.boxes.slice(0, this.i)) {
-      if (box.bin === this.model.boxes[this.i].bin) pen.strokeRect(...rectangle(box.x, box.y, box.w, box.d));
+    for (const other of this.model.boxes.slice(0, this.i)) {
+      if (other.bin !== this.model.boxes[this.i].bin) continue;
+      pen.save();
+      pen.translate(...at(other.x + other.w / 2, other.y + other.d / 2));
+      pen.rotate((-(other.yaw ?? 0) * Math.PI) / 180);
+      pen.strokeRect(-scale * other.w / 2, -scale * other.d / 2, scale * other.w, scale * other.d);
+      pen.restore();
     }
     pen.strokeStyle = colour("--ink");
     pen.strokeRect(...rectangle(0, 0, width, depth));
@@ -158,16 +180,16 @@ class WhyPanel {
       pen.fillStyle = value === null ? this.model.doc.unknown : this.model.scaleColour(share(value));
       pen.fillRect(...(cells ? [x + 1, y - side + 1, side - 2, side - 2] : [x - 5, y - 5, side, side]));
     }
-    const box = this.model.boxes[this.i];
-    if (Number(this.parts["map-orientation"].value) === box.orientation || chosen < 0) {
+    const { planned } = this;
+    if (Number(this.parts["map-orientation"].value) === this.model.boxes[this.i].orientation || chosen < 0) {
       pen.strokeStyle = colour("--bad");
       pen.lineWidth = 4;
-      pen.strokeRect(...rectangle(box.x, box.y, box.w, box.d));
+      pen.strokeRect(...rectangle(planned.x, planned.y, planned.w, planned.d));
     }
     const dark = shade === "probabilities" ? `${LEAST} or less (each power of ten is a step)` : plain(low, 4);
     const bright = shade === "probabilities" ? 1 : plain(high, 4);
     const range = known.length ? ` Dark: ${dark}, bright: ${bright}; grey: not computed.` : "";
-    const text = `Seen from above: where the low corner of the box may lie. Red: the box.${range}`;
+    const text = `Seen from above: where the low corner of the box may lie. Red: the ${this.moved ? "planned " : ""}box.${range}`;
     this.parts["map-note"].textContent = text;
     map.setAttribute("aria-label", `${rows.length} legal placements from above. ${text}`);
   }
