@@ -585,7 +585,7 @@ def test_pages_of_other_sites_are_refused(client: TestClient) -> None:
 def test_the_bodies_have_the_keys_of_the_packer() -> None:
     assert set(models.Box.model_fields) == {"sides", "order", "step", *BOX_ATTRIBUTES}
     options = {each.name for each in fields(ExactSpec)} - set(models.LEFT_OUT)
-    own = {"id", "policy", "plan", "grid_mm", "seed", "present"}
+    own = {"id", "policy", "plan", "grid_mm", "seed", "present", "explain"}
     assert set(models.OpenBin.model_fields) == options | own
 
 
