@@ -24,7 +24,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         page_path = Path(folder, "demo.html")
         assert demo.main(["--boxes", str(BOXES), "--no-open", "--out", str(page_path)]) == 0
-        film = ["--title", "search", "--seconds", "0.3", "--out", str(DOCS / "pallet.gif")]
+        film = ["--title", "marl-pack demo", "--seconds", "0.3", "--out", str(DOCS / "pallet.gif")]
         assert command.main([str(page_path.with_suffix(".json")), *film]) == 0
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(

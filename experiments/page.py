@@ -23,6 +23,7 @@ from docs.pages import between
 from docs.pages import table as markdown_table
 from experiments import ablations, packer, packing, physics, planning, real_cell, real_goods
 from experiments.rows import main_of, mean
+from marl_pack.exact.spec import ExactSpec
 from marl_pack.files import write_atomically
 from marl_pack.option_record import options_of
 from marl_pack.physics import table1
@@ -226,7 +227,9 @@ def render_service(folder: Path = RESULTS) -> str:
     return template("service").render(
         loads=sorted(rows.items(), key=lambda row: (row[0].split(",")[0], row[1]["clients"])),
         memory=memory, cores=memory["record"]["cores"], made=lambda name: made(tables[name]),
-        limits=options_of(ServiceLimits), codes=sorted(CODES.items(), key=lambda code: code[1][0]),
+        limits=options_of(ServiceLimits),
+        options=[each for each in options_of(ExactSpec) if each.name not in ("alpha", "beta")],
+        codes=sorted(CODES.items(), key=lambda code: code[1][0]),
     )  # fmt: skip
 
 

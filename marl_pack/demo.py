@@ -72,12 +72,12 @@ def parser(program: str = PROGRAM) -> Parser:
     """Return the parser of the command's options."""
     options = Parser(
         prog=program, usage=f"{program} [OPTIONS]", description=__doc__.split("\n\n")[0],
-        examples=("", "--boxes 100 --seed 3", "--policy max_contact --no-open"),
+        examples=("", "--boxes 100 --seed 3", "--policy search --no-open"),
     )  # fmt: skip
     add = options.add_argument
     add("--boxes", type=int, default=60, metavar="N", help="number of cases (default: 60)")
-    add("--policy", choices=("search", *MM_POLICIES), default="search",
-        help="what chooses the places (default: search, for 0.1 s a box)")  # fmt: skip
+    add("--policy", choices=(*MM_POLICIES, "search"), default="linear",
+        help="what chooses the places; search takes 0.1 s a box (default: linear)")  # fmt: skip
     add("--seed", type=int, default=0, help="seed of the cases (default: 0)")
     add("--out", type=Path, default=Path("demo.html"), metavar="FILE",
         help="the page (.html); the plan is written beside it, with the ending .json; files that "

@@ -84,7 +84,7 @@ def pack_file(feed: Feed, console: Console) -> None:
     """Pack the boxes of a file, with a progress bar."""
     path = Path(feed.chosen.boxes)
     if not path.is_file():
-        raise no_such_file(str(path))
+        raise no_such_file(str(path), in_mm=True)
     boxes = list(of_orders(read_orders(path, feed.packer.spec)))
     growing = Growing(feed.chosen.out, save_plan)
     with growing, make_progress(console) as bar:

@@ -75,7 +75,7 @@ def choose_mm(arguments: argparse.Namespace, console: Console) -> SetupMm:
     if arguments.items is None:
         raise ValueError("--world mm: needs --items FILE, a .csv or .json file with sizes in mm")
     if not Path(arguments.items).is_file():
-        raise no_such_file(arguments.items)
+        raise no_such_file(arguments.items, in_mm=True)
     spec = ExactSpec.of(given_options(arguments, ExactSpec))
     stream = make_goods_stream(
         arguments.items, spec, order=arguments.order or ORDERS[0], length=arguments.length,

@@ -75,7 +75,7 @@ def check_options(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--out {arguments.out}: needs a name that ends in .json")
     check_writable(arguments.out)
     if not Path(arguments.items).is_file():
-        raise no_such_file(arguments.items)
+        raise no_such_file(arguments.items, in_mm=True)
     if not 0 < real_number(arguments.minutes, "--minutes") <= MOST_MINUTES:
         raise ValueError(f"--minutes {arguments.minutes:g}: needs a number > 0, at most 1e6")
     if arguments.start is not None and not arguments.start.is_file():

@@ -190,10 +190,10 @@ def test_unknown_values_have_a_colour_of_their_own(plan: Plan) -> None:
 def test_captions_move_and_the_bar_grows(plan: Plan) -> None:
     film = Film(plan, "two orders")
     assert len(film) == len(plan) + 1
-    assert film.caption(0) == "two orders: box 0 of 11, bin 1 of 2, 0 %"
+    assert film.caption(0) == "two orders: box 0 of 11, bin 0, 0 %"
     filled = plan.in_bin(0).first(4).utilization
-    assert film.caption(4) == f"two orders: box 4 of 11, bin 1 of 2, {100 * filled:.0f} %"
-    assert film.caption(11).startswith("two orders: box 11 of 11, bin 2 of 2, ")
+    assert film.caption(4) == f"two orders: box 4 of 11, bin 0, {100 * filled:.0f} %"
+    assert film.caption(11).startswith("two orders: box 11 of 11, bin 1, ")
     done = [int((film.frame(step)[-BAR // 2] == (11, 92, 173)).all(1).sum()) for step in (0, 4, 11)]
     assert done == [0, round(720 * 4 / 11), 720]
 

@@ -131,7 +131,7 @@ def test_answers_and_plan_are_those_of_a_packer(client: TestClient) -> None:
         "closed": True, "boxes": len(packer.placements), "step": step + 1,
     }  # fmt: skip
     for action in ("place", "offer", "undo", "close", "actual"):
-        body: Any = {"sides": [1, 1, 1]} if action in ("place", "offer") else {}
+        body: Any = {"sides": [10, 10, 10]} if action in ("place", "offer") else {}
         body = {"x": 1, "y": 1} if action == "actual" else body
         assert error(client.post(f"/bins/a/{action}", json=body))[:2] == (409, "closed")
     assert done(client.get("/bins/a/plan")) == plan
@@ -184,7 +184,7 @@ BAD = [
     ("/bins", '{"policy": "search", "plan": "budgt=5s"}', "impossible", "needs budget=500ms"),
     ("/bins", '{"plan": "budget=5ms"}', "impossible", "plan: needs the policy search"),
     ("/bins", '{"catalogue": "goods.csv"}', "impossible", "unknown key 'catalogue'"),
-    ("/bins", '{"id": "../x"}', "impossible", "id: string should match pattern"),
+    ("/bins", '{"id": "../x"}', "impossible", "id: needs letters, digits"),
     ("/bins", '{"id": "a"}', "exists", "there is a bin with this id already"),
     ("/bins", '{"bin_mm": [1200, 800]}', "impossible", "bin_mm.2: is missing"),
     ("/bins", '{"bin_mm": [1200, 800, 0]}', "impossible", "needs three lengths in millimetres > 0"),
@@ -196,18 +196,23 @@ BAD = [
     ("/bins", '{"grid_mm": 50}', "impossible", "only agents trained on cells see a grid"),
     ("/bins", '{"present": {"boxes": []}}', "impossible", "present: not a plan in JSON"),
     ("/bins", "[]", "impossible", "body: input should be a valid dictionary"),
-    ("/bins/nowhere/place", '{"sides": [1, 1, 1]}', "unknown_bin", "there is no such bin"),
+    ("/bins/nowhere/place", '{"sides": [10, 10, 10]}', "unknown_bin", "there is no such bin"),
     ("/bins/a/place", "", "impossible", "body: is missing"),
     ("/bins/a/place", "{}", "impossible", "sides: is missing"),
     ("/bins/a/place", '{"sides": [1, 2]}', "impossible", "sides.2: is missing"),
-    ("/bins/a/place", '{"sides": [1, 2, 0]}', "impossible", "the box is [1.0, 2.0, 0.0]: zero or"),
-    ("/bins/a/place", '{"sides": [1, 2, 0.05]}', "impossible", "whole units of 0.1 mm"),
+    (
+        "/bins/a/place",
+        '{"sides": [10, 20, 0]}',
+        "impossible",
+        "zero or negative",
+    ),
+    ("/bins/a/place", '{"sides": [10, 20, 0.05]}', "impossible", "whole units of 0.1 mm"),
     ("/bins/a/place", '{"sides": [1, 2, true]}', "impossible", "valid number, not true"),
     ("/bins/a/place", '{"sides": [1, 2, "3"]}', "impossible", 'valid number, not "3"'),
     ("/bins/a/place", '{"sides": [1, 2, 1e999]}', "impossible", "finite number"),
-    ("/bins/a/place", '{"sides": [1, 2, 3], "weight": -1}', "impossible", "weight"),
+    ("/bins/a/place", '{"sides": [10, 20, 30], "weight": -1}', "impossible", "weight"),
     ("/bins/a/place", '{"sides": [1, 2, 3], "weigth": 1}', "impossible", "did you mean 'weight'"),
-    ("/bins/a/place", '{"sides": [1, 2, 3], "orientations": [6]}', "impossible", "0 … 5"),
+    ("/bins/a/place", '{"sides": [10, 20, 30], "orientations": [6]}', "impossible", "0 … 5"),
     ("/bins/a/place", '{"sides": [1, 2, 3], "step": 4}', "wrong_step", "the bin is at step 1"),
     (
         "/bins/a/place",
@@ -217,7 +222,7 @@ BAD = [
     ),
     ("/bins/a/place", '{"sides": [1, 2, NaN]}', "not_json", "NaN is not a number"),
     ("/bins/a/place", '{"sides": [1, 2, -Infinity]}', "not_json", "-Infinity is not a number"),
-    ("/bins/a/place", '{"sides": [1, 2, 3], "sides": [1, 2, 3]}', "not_json", "is given twice"),
+    ("/bins/a/place", '{"sides": [1, 2, 3], "sides": [10, 20, 30]}', "not_json", "is given twice"),
     ("/bins/a/place", '{"sides": [1, 2, ' + 5000 * "9" + "]}", "not_json", "thousands of digits"),
     ("/bins/a/place", '{"sides": [1, 2, ' + 400 * "9" + "]}", "impossible", "valid number"),
     ("/bins/a/place", '{"sides": ' + 20_000 * "[" + 20_000 * "]" + "}", "not_json", "too deeply"),
@@ -225,12 +230,12 @@ BAD = [
     ("/bins/a/place", '{"sides": [1, 2', "not_json", "Expecting"),
     ("/bins/a/place", "{" + 300_000 * " " + "}", "too_large", "at most 262144 bytes"),
     ("/bins/a/actual", '{"x": 1}', "impossible", "y: is missing"),
-    ("/bins/a/actual", '{"x": 1, "y": 1}', "impossible", "would reach out of the bin"),
+    ("/bins/a/actual", '{"x": 1, "y": 1}', "impossible_pose", "would reach out of the bin"),
     ("/bins/a/actual", '{"x": 200, "y": 150, "yaw": 46}', "impossible", "degrees from -45 to 45"),
     ("/bins/a/actual", '{"x": 200, "y": 150, "id": "b"}', "other_box", "placed last is 'first'"),
     ("/bins/a/undo", '{"step": 0}', "wrong_step", "the bin is at step 1"),
     ("/nothing", "{}", "not_found", "there is no such page"),
-    ("/health", "{}", "wrong_method", "does not take this method"),
+    ("/health", "{}", "wrong_method", "the page takes GET only"),
 ]
 """Path and body of requests, and what the answer says."""
 
@@ -641,7 +646,7 @@ def test_an_error_in_the_service_says_nothing_of_the_code(
 ) -> None:
     done(client.post("/bins", json={"id": "a"}), 201)
     monkeypatch.setattr(Packer, "place", lambda *_, **__: 1 / 0)
-    refused = client.post("/bins/a/place", json={"sides": [1, 1, 1]})
+    refused = client.post("/bins/a/place", json={"sides": [10, 10, 10]})
     assert error(refused) == (500, "internal", "an error in the service; its log says more")
 
 
@@ -717,11 +722,53 @@ def test_the_session_of_the_page_runs_as_it_is_printed(tmp_path: Path) -> None:
 def test_the_example_of_a_robot_cell_runs(tmp_path: Path) -> None:
     example = Path(__file__).parent.parent / "examples/robot_cell.py"
     with serving(["--data", str(tmp_path / "a.sqlite")]) as (_, address):
-        result = subprocess.run(
-            [sys.executable, str(example), address, str(tmp_path / "plan.json")],
-            capture_output=True, text=True, timeout=60,
-        )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    plan = Plan.from_json(tmp_path / "plan.json")
-    assert len(plan) == result.stdout.count("placed")
-    assert plan.yaws.any()
+        words = [sys.executable, str(example), address, "p7", str(tmp_path / "plan.json")]
+        for _ in range(2):  # the second time it gets the answers of the first time
+            result = subprocess.run(words, capture_output=True, text=True, timeout=60)
+            assert result.returncode == 0, result.stderr
+            plan = Plan.from_json(tmp_path / "plan.json")
+            assert len(plan) == 5 == result.stdout.count("middle at")
+            assert plan.yaws.all()
+        words[2] = address.removeprefix("http://")
+        result = subprocess.run(words, capture_output=True, text=True, timeout=60)
+        assert result.returncode == 2
+        assert "needs http://" in result.stderr
+
+
+def test_the_first_page_lists_the_bins(client: TestClient) -> None:
+    assert "No bins yet" in client.get("/").text
+    for id in ("first", "second"):
+        done(client.post("/bins", json={"id": id}), 201)
+    done(client.post("/bins/first/close", json={}))
+    page = client.get("/").text
+    assert page.index("second") < page.index("first")
+    assert 'href="bins/second/replay"' in page
+    assert page.count("<td>open</td>") == page.count("<td>closed</td>") == 1
+
+
+def test_a_bin_says_its_options(client: TestClient) -> None:
+    done(client.post("/bins", json={"id": "a", "margin_mm": 15, "clearance_mm": 4}), 201)
+    options = done(client.get("/bins/a"))["options"]
+    assert options["margin_mm"] == 15
+    assert set(options) == {each.name for each in fields(ExactSpec)}
+
+
+def test_an_impossible_pose_has_a_code_of_its_own(client: TestClient) -> None:
+    done(client.post("/bins", json={"id": "a"}), 201)
+    done(client.post("/bins/a/place", json={"sides": CARTONS[0]}))
+    status, code, message = error(client.post("/bins/a/actual", json={"x": 299, "y": 200}))
+    assert (status, code) == (409, "impossible_pose")
+    assert "reach out of the bin by 1.0 mm" in message
+    assert done(client.get("/bins/a"))["step"] == 1
+
+
+@pytest.mark.parametrize("path", ["/bins/a/place", "/bins/a/offer"])
+def test_metres_are_refused(client: TestClient, path: str) -> None:
+    done(client.post("/bins", json={"id": "a"}), 201)
+    for request, body in (
+        (path, {"sides": [0.3, 0.2, 0.1]}),
+        ("/bins", {"bin_mm": [1.2, 0.8, 1.5]}),
+    ):
+        status, code, message = error(client.post(request, json=body))
+        assert (status, code) == (422, "impossible")
+        assert "lengths are in millimetres" in message

@@ -500,7 +500,8 @@ class Packer:
             why = explain(self.policy, turn, 0, move) if self.arguments["explain"] else None
             return self._answer(item, row, move & 7, support, k), move, why
         if not bins:
-            bins_used = f"all {self.most_bins} bins are used"
+            many = self.most_bins != 1
+            bins_used = f"all {self.most_bins} bins are used" if many else "the only bin is used"
             return _no(item, "other_order", f"it begins an order, and {bins_used}"), -1, None
         return why_not(self.bin if fits_order else bins[len(self.packed)], item), -1, None
 

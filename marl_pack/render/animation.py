@@ -72,11 +72,11 @@ class Film:
         return len(self.plan) + 1
 
     def caption(self, step: int) -> str:
-        """Return the caption after ``step`` boxes, such as "box 7 of 23, bin 1 of 2, 61 %"."""
+        """Return the caption after ``step`` boxes, such as "box 7 of 23, bin 0, 61 %"."""
         bin = self.bin_at(step)
         words = [f"box {step} of {len(self.plan)}"]
         if len(self._bins) > 1:
-            words.append(f"bin {bin + 1} of {len(self._bins)}")
+            words.append(f"bin {bin}")
         here = int((self.plan.bins[:step] == bin).sum())
         words.append(f"{100 * self._bins[bin].first(here).utilization:.0f} %")
         return (f"{self.title}: " if self.title else "") + ", ".join(words)
@@ -135,7 +135,7 @@ def bins_picture(film: Film, step: int) -> Frame:
     for k in range(opened):
         of_bin = np.flatnonzero(plan.bins[:step] == k)
         packed = plan.in_bin(k).first(len(of_bin))
-        title = f"bin {k + 1}: {len(packed)} boxes, {packed.utilization:.0%}"
+        title = f"bin {k}: {len(packed)} boxes, {packed.utilization:.0%}"
         colours = [film.colours[i] for i in of_bin] or PALETTE
         pictures.append(draw_plan(packed, title, film.pixels, colours))
     across = min(4, opened)

@@ -21,8 +21,8 @@ SCALE: tuple[str, ...] = tuple(to_hex(c) for c in colormaps["viridis"](np.linspa
 """Colours from the lowest number to the highest one."""
 UNKNOWN = "#9aa1a9"
 """Colour of a box whose value is unknown."""
-COLOURINGS = ("item", "order", "bin", "weight", "margin")
-"""What colours can show."""
+COLOURINGS = ("item", "size", "order", "bin", "weight", "margin")
+"""What colours can show; boxes of the same size have the same three sides, in any order."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,10 @@ def colour_plan(plan: Plan, by: str) -> Colouring | None:
     numbers: Any = np.arange(len(plan))
     names: tuple[str, ...] = ()
     if by == "bin":
-        numbers, names = plan.bins, tuple(f"bin {k + 1}" for k in range(len(plan.bin_sizes)))
+        numbers, names = plan.bins, tuple(f"bin {k}" for k in range(len(plan.bin_sizes)))
+    elif by == "size":
+        sizes, numbers = np.unique(np.sort(plan.sides, 1)[:, ::-1], axis=0, return_inverse=True)
+        names = tuple(" × ".join(f"{side:g}" for side in size) for size in sizes.tolist())
     elif by == "order":
         names = tuple(dict.fromkeys(plan.orders))
         of_bins = np.array([names.index(order) for order in plan.orders], np.int64)

@@ -24,7 +24,7 @@ PROGRAM = "python -m marl_pack.replay"
 PAGE = ".html"
 PICTURES = (".png", ".gif", ".mp4")
 ONLY_PICTURES = ("step", "seconds", "pixels", "colour")
-COLOURINGS = ("item", "order", "bin", "weight", "margin")
+COLOURINGS = ("item", "size", "order", "bin", "weight", "margin")
 LEAST_PIXELS, MOST_PIXELS = 160, 4096
 SHORTEST, LONGEST = 0.05, 60.0
 """Limits of ``--seconds``."""
@@ -115,7 +115,7 @@ def write_page(path: Path, plan: Plan, title: str) -> None:
 def open_page(path: Path, console: Console) -> None:
     """Open a page in the browser, or say that there is none."""
     if not webbrowser.open(path.resolve().as_uri()):
-        console.print("no browser found: open the page yourself")
+        console.print(f"no browser found: open {path.resolve().as_uri()}", soft_wrap=True)
 
 
 def write_picture(chosen: argparse.Namespace, plan: Plan, title: str, console: Console) -> None:

@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
@@ -20,6 +21,7 @@ from marl_pack.packer.packer import Packer
 from marl_pack.plan import Plan
 from marl_pack.service import models
 from marl_pack.service.guard import App, Guard
+from marl_pack.service.home import bins_page
 from marl_pack.service.limits import LONGEST_KEY
 from marl_pack.service.reading import StrictRoute, describe
 from marl_pack.service.refusals import CODES, Refusal, code_of, document
@@ -42,6 +44,8 @@ Key = Annotated[
         description="The same request with the same key is done once.",
     ),
 ]  # fmt: skip
+LISTED = 200
+"""Bins on the first page."""
 PAGE = {
     "content-security-policy": "default-src 'self' 'unsafe-inline' data: blob:",
     "x-content-type-options": "nosniff",
@@ -81,6 +85,11 @@ def _given(body: models.Model | None) -> dict[str, Any]:
 def make_router(service: Service) -> APIRouter:
     """Return the routes of the service."""
     router = APIRouter(route_class=StrictRoute)
+
+    @router.get("/", include_in_schema=False)
+    def home() -> Response:
+        """Return a page with links to the bins that were opened last."""
+        return Response(bins_page(service.latest(LISTED)), 200, PAGE, "text/html; charset=utf-8")
 
     @router.get("/health", tags=["service"], summary="Whether the service runs")
     async def health() -> dict[str, str]:
@@ -126,7 +135,8 @@ def make_router(service: Service) -> APIRouter:
 
     @router.post(
         "/bins/{id}/actual", tags=["boxes"], summary="Report where the robot really put the box",
-        response_model=models.Placed, responses=CHANGES | _errors("nothing_done", "other_box"),
+        response_model=models.Placed,
+        responses=CHANGES | _errors("nothing_done", "other_box", "impossible_pose"),
     )  # fmt: skip
     async def actual(id: BinId, body: models.Actual, key: Key = None) -> Any:
         return _json(await service.change(id, "actual", _given(body), key))
@@ -190,6 +200,7 @@ def _state(bin: Bin, packer: Packer) -> str:
         "id": bin.id, "opened": bin.row.opened, "policy": json.loads(bin.row.arguments)["policy"],
         "boxes": state.boxes[0], "utilization": state.utilization[0], "weight": state.weight[0],
         "least_margin": state.least_margin, "step": bin.step, "closed": bin.closed,
+        "options": asdict(packer.spec),
     })  # fmt: skip
 
 
@@ -227,6 +238,8 @@ def make_app(service: Service, token: str | None = None) -> App:
             return answer(error.status_code, error.code, error.detail, error.headers)
         code = code_of(error.status_code)
         meaning = CODES[code][1] if code in CODES else str(error.detail)
+        if code == "wrong_method":
+            meaning = f"the page takes {(error.headers or {}).get('Allow', 'other methods')} only"
         return answer(error.status_code, code, meaning, error.headers)
 
     @app.exception_handler(RequestValidationError)

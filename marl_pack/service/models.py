@@ -237,6 +237,7 @@ class State(Listed):
     least_margin: float | None = Described(
         description="Smallest margin of a box that rests on others, in millimetres."
     )
+    options: dict[str, Any] = Described(description="The options of the bin.")
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -244,7 +245,7 @@ class State(Listed):
                 {
                     "id": "pallet-7", "opened": "2026-01-31T08:15:00+00:00", "closed": False,
                     "policy": "max_contact", "boxes": 2, "utilization": 0.083, "weight": 16.4,
-                    "least_margin": 24.5, "step": 2,
+                    "least_margin": 24.5, "step": 2, "options": {"bin_mm": [1200, 800, 1500]},
                 }
             ]
         }

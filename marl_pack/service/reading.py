@@ -64,6 +64,14 @@ class StrictRoute(APIRoute):
         return handle
 
 
+NEEDS = {
+    "tuple_type": "needs a list of numbers",
+    "list_type": "needs a list",
+    "string_pattern_mismatch": "needs letters, digits, _, . and -, at most 64, and no . or - first",
+}
+"""What a value needs, by the type of the error."""
+
+
 def describe(errors: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
     """Return one sentence for the errors that the check of a request found.
 
@@ -79,7 +87,7 @@ def describe(errors: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
         return f"unknown key {shown(where)}{renamed.guess(where, names)}"
     if first["type"] == "missing":
         return f"{where or 'body'}: is missing"
-    message = first["msg"][:1].lower() + first["msg"][1:]
+    message = NEEDS.get(first["type"], first["msg"][:1].lower() + first["msg"][1:])
     return f"{where or 'body'}: {message}, not {_as_json(first.get('input'))}"
 
 

@@ -18,12 +18,13 @@ CODES = {
     "foreign_origin": (403, "the request comes from another web site"),
     "unknown_bin": (404, "there is no such bin"),
     "not_found": (404, "there is no such page"),
-    "wrong_method": (405, "the page does not take this method"),
+    "wrong_method": (405, "the page takes other methods"),
     "exists": (409, "a bin has this id already"),
     "closed": (409, "the bin is closed"),
     "wrong_step": (409, "the bin has changed since the step that the request names"),
     "nothing_done": (409, "there is nothing to undo or to report"),
     "other_box": (409, "another box was placed last"),
+    "impossible_pose": (409, "no box can be where the report says"),
     "too_many_bins": (409, "as many bins are open as may be"),
     "too_many_steps": (409, "the bin has as many changes as it may"),
     "slow": (408, "the body took too long to arrive"),
@@ -60,7 +61,8 @@ def checking_values() -> Iterator[None]:
         yield
     except (ValueError, FileNotFoundError) as error:
         message = str(error).replace("box: row 0", "the box")  # the only one of the request
-        raise Refusal("impossible", message) from error
+        code = "impossible_pose" if message.startswith("actual: ") else "impossible"
+        raise Refusal(code, message) from error
 
 
 def document(code: str, message: str) -> dict[str, Any]:

@@ -38,6 +38,8 @@ THREADS = 64
 """Bins that may change at once."""
 READERS = 4
 """Bins that may be read at once, also while all threads above are busy."""
+SHORTEST_MM = 5
+"""Shortest longest side of a box; a shorter one is in metres or centimetres."""
 OPTIONS = tuple(each.name for each in options_of(ExactSpec))
 
 
@@ -168,6 +170,11 @@ class Service:
             ValueError: if an argument is impossible; says what would be right.
         """
         options = {name: arguments[name] for name in OPTIONS if name in arguments}
+        if "bin_mm" in options and 0 < max(options["bin_mm"]) < 10 * SHORTEST_MM:
+            raise ValueError(
+                f"bin_mm {shown(options['bin_mm'])}: below {10 * SHORTEST_MM} mm; lengths are in "
+                "millimetres"
+            )
         most = self.limits.max_boxes
         spec = ExactSpec(**{"max_boxes": min(most, 256), **options})
         if spec.max_boxes > most:
@@ -192,6 +199,10 @@ class Service:
             for row in rows[:limit]
         ]
         return {"bins": listed, "next": listed[-1]["id"] if len(rows) > limit else None}
+
+    def latest(self, limit: int) -> Sequence[BinRow]:
+        """Return the bins that were opened last, the last one first."""
+        return self.store.latest(limit)
 
     def _row(self, id: str) -> BinRow:
         row = self.store.bin(id)
@@ -261,6 +272,8 @@ class Service:
 
     def _do_offer(self, bin: Bin, body: dict[str, Any]) -> Answer:
         box = dict(body)
+        with checking_values():
+            check_box(box)
         with bin.changing:
             packer = self._restored(bin)
             self._check(bin, box.pop("step", None))
@@ -298,6 +311,7 @@ class Service:
             packer = self._restored(bin)
         if kind == "place":
             with checking_values():
+                check_box(arguments)
                 packer.offer(**arguments)  # the policy decides, while others may read the bin
         with bin.changing:
             return self._commit(bin, packer, kind, arguments, keyed)
@@ -364,6 +378,17 @@ def _again(keyed: Keyed, before: tuple[bytes, str]) -> Answer:
             f"Idempotency-Key {shown(keyed.key)}: was used for another request; needs a new key",
         )
     return Answer(before[1], replayed=True)
+
+
+def check_box(body: dict[str, Any]) -> None:
+    """Refuse a box whose sides are surely not in millimetres.
+
+    Raises:
+        ValueError: if its longest side is below :data:`SHORTEST_MM`.
+    """
+    if 0 < max(body["sides"]) < SHORTEST_MM:
+        sides = shown(body["sides"])
+        raise ValueError(f"sides {sides}: below {SHORTEST_MM} mm; lengths are in millimetres")
 
 
 # --- what a request does to the packer ------------------------------------------------------------

@@ -224,13 +224,19 @@ class Store:
         """
         return self._bins("b.number > ?", after, limit)
 
-    def _bins(self, condition: str, value: Any, limit: int) -> list[BinRow]:
+    def latest(self, limit: int) -> list[BinRow]:
+        """Return the bins that were opened last, the last one first."""
+        return self._bins("b.number > ?", 0, limit, "DESC")
+
+    def _bins(
+        self, condition: str, value: Any, limit: int, order: str = "ASC"
+    ) -> list[BinRow]:  # fmt: skip
         with self._reading() as file:
             rows = file.execute(
                 "SELECT b.number, b.id, b.opened, b.arguments, "
                 "(SELECT coalesce(max(step), 0) FROM log WHERE bin = b.number), "
                 "EXISTS (SELECT 1 FROM log WHERE bin = b.number AND kind = 'close') "
-                f"FROM bins b WHERE {condition} ORDER BY b.number LIMIT ?", (value, limit),
+                f"FROM bins b WHERE {condition} ORDER BY b.number {order} LIMIT ?", (value, limit),
             ).fetchall()  # fmt: skip
         return [
             BinRow(number, name, opened, arguments, step, bool(closed))

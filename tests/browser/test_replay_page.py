@@ -122,7 +122,7 @@ def test_every_control_does_what_it_says(open_page, pallet, log) -> None:
     assert f"{100 * plan.first(30).utilization:.0f} %" in text(page, "#caption")
 
     colourings = page.locator("#colour option").all_inner_texts()
-    assert colourings == ["item", "weight", "margin"]
+    assert colourings == ["item", "size", "weight", "margin"]
     for name in colourings:
         page.select_option("#colour", name)
         pictures.add(picture(page))
@@ -231,6 +231,36 @@ def test_the_values_on_hover_are_those_of_the_plan(open_page, pallet, log) -> No
     log(f"hovered over {compared} boxes: all values equal those of the plan")
 
 
+def test_the_table_has_all_values_and_sorts(open_page, orders) -> None:
+    plan, url = orders
+    page = open_page(url)
+    page.locator("details summary").click()
+    heads = [head.removesuffix(" ↑") for head in page.locator("#boxes th").all_inner_texts()]
+    assert heads == [
+        "box",
+        "size",
+        "position",
+        "bin",
+        "support",
+        "margin",
+        "weight, kg",
+        "load, kg",
+    ]
+    loads = [load_on(plan, i, len(plan)) for i in range(len(plan))]
+    page.click("#boxes thead button >> nth=7")
+    page.click("#boxes thead button >> nth=7")
+    assert page.locator("#boxes th").nth(7).get_attribute("aria-sort") == "descending"
+    rows = [row.locator("td").all_inner_texts() for row in page.locator("#boxes tbody tr").all()]
+    assert [float(row[7]) for row in rows] == pytest.approx(sorted(loads, reverse=True), abs=0.006)
+    for row in rows:
+        i = int(row[0].split()[0]) - 1
+        assert numbers(row[1]) == pytest.approx(plan.sides[i].tolist(), abs=0.06)
+        assert numbers(row[2]) == pytest.approx(plan.positions[i].tolist(), abs=0.06)
+        assert int(row[3]) == plan.bins[i]
+        assert numbers(row[5]) == pytest.approx([plan.margins[i]], abs=0.06)
+        assert float(row[6]) == pytest.approx(plan.weights[i], abs=0.006)
+
+
 def test_a_click_keeps_the_values_of_a_box(open_page, orders) -> None:
     plan, url = orders
     page = open_page(f"{url}#bin=0")
@@ -302,6 +332,9 @@ def test_a_change_keeps_the_selected_box_and_the_focus(open_page, orders) -> Non
     page.evaluate("page.update(JSON.parse(JSON.stringify(page.model.doc)), false)")
     assert page.evaluate("page.selected") == 3
     assert page.evaluate("document.activeElement.textContent").startswith("4 ")
+    page.click("#boxes thead button >> nth=0")
+    assert page.locator("#boxes tbody button").first.inner_text().startswith("14 ")
+    page.click("#boxes thead button >> nth=0")
     page.evaluate(
         "(() => { const doc = JSON.parse(JSON.stringify(page.model.doc));"
         " doc.boxes[3].id = 'other'; page.update(doc, false); })()"
@@ -317,7 +350,7 @@ def test_what_scrolls_keeps_its_keys(open_page, pallet) -> None:
     assert step(page) == 20
     assert not page.evaluate("page.playing")
     page.keyboard.press("c")
-    assert page.locator("#colour").input_value() == "weight"
+    assert page.locator("#colour").input_value() == "size"
 
 
 def test_a_choice_of_shading_stays(open_page, tmp_path) -> None:
@@ -382,7 +415,7 @@ def test_bins_orders_and_boxes_without_a_place_are_shown(open_page, orders) -> N
     assert "long" in text(page, "#left-out")
     assert plan.left_out[0].reason in text(page, "#left-out")
     assert page.locator("#colour option").all_inner_texts() == [
-        "item", "order", "bin", "weight", "margin",
+        "item", "size", "order", "bin", "weight", "margin",
     ]  # fmt: skip
     page.select_option("#bin", "all")
     everything = page.evaluate("page.view.visible.length")

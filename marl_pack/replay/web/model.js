@@ -92,7 +92,7 @@ class Model {
   caption(step) {
     const bin = this.openBin(step);
     const words = [`Box ${step} of ${this.last}`];
-    if (this.bins.length > 1) words.push(`bin ${bin + 1} of ${this.bins.length}`);
+    if (this.bins.length > 1) words.push(`bin ${bin}`);
     words.push(`${percent(this.binsAt(step)[bin].utilization)} filled`);
     return words.join(" · ");
   }
@@ -118,7 +118,7 @@ class Model {
       ["size", "Size", `${[box.w, box.d, box.h].map((v) => this.length(v)).join(" × ")} ${this.unit}`],
       ["position", "Position", `${[box.x, box.y, box.z].map((v) => this.length(v)).join(", ")} ${this.unit}`],
     ];
-    if (this.bins.length > 1) rows.push(["bin", "Bin", `${box.bin + 1}`]);
+    if (this.bins.length > 1) rows.push(["bin", "Bin", `${box.bin}`]);
     if (this.orderNames.length > 1) rows.push(["order", "Order", short(this.orders[box.bin], 200)]);
     if (box.orientation >= 0) rows.push(["orientation", "Orientation", `${SIDES_IN_ORDER[box.orientation]}`]);
     if (box.yaw) rows.push(["yaw", "Yaw", `${plain(box.yaw)}°`]);

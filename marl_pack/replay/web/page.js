@@ -12,6 +12,7 @@ class Page {
     this.step = 0;
     this.selected = -1;
     this.hovered = -1;
+    this.sorting = { column: "box", down: false };
     this.why = new WhyPanel((placement) => this.view?.showGhost(placement));
     this.load(doc);
     this.step = this.model.last;
@@ -29,9 +30,7 @@ class Page {
     const atEnd = this.step === this.model.last && !this.playing;
     const same = (i) => i >= 0 && JSON.stringify(doc.boxes[i]) === JSON.stringify(this.model.boxes[i]);
     if (!same(this.selected)) this.selected = -1;
-    const focused = [...$("boxes").querySelectorAll("button")].indexOf(document.activeElement);
     this.load(doc);
-    if (focused >= 0) $("boxes").querySelectorAll("button")[focused]?.focus();
     this.view?.setModel(this.model);
     this.setTheme(document.documentElement.dataset.theme);
     this.goTo(atEnd ? this.model.last : this.step, drop && atEnd);
@@ -46,7 +45,7 @@ class Page {
     const [colour, bin] = [$("colour").value, $("bin").value];
     const colourings = this.model.colourings;
     options($("colour"), colourings.map((name) => [name, name]), colourings.includes(colour) ? colour : "item");
-    const bins = this.model.bins.map((_, k) => [k, [k + 1, ...(this.model.orders[k] ? [short(this.model.orders[k], 40)] : [])].join(": ")]);
+    const bins = this.model.bins.map((_, k) => [k, [k, ...(this.model.orders[k] ? [short(this.model.orders[k], 40)] : [])].join(": ")]);
     const many = bins.length > 1;
     options($("bin"), many ? [["open", "open one"], ["all", "all"], ...bins] : [["all", "all"]], many ? bin || "open" : "all");
     if ($("bin").selectedIndex < 0) $("bin").selectedIndex = 0;
@@ -55,17 +54,43 @@ class Page {
     $("left-out").hidden = !left.length;
     $("left-out").querySelector("ul").replaceChildren(...left.map((box) =>
       element("li", `${short(box.id || "box", 60)} (${[box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × ")}): ${box.reason}`)));
-    fillTable($("boxes"), ["box", "size", "position", "kg"], this.model.boxes.map((box, i) => ({
-      cells: [
-        `${i + 1} ${short(box.id, 40)}`, [box.w, box.d, box.h].map((v) => this.model.length(v)).join(" × "),
-        [box.x, box.y, box.z].map((v) => this.model.length(v)).join(", "), plain(box.weight),
-      ],
+  }
+
+  /** Fill the table of all boxes, if it is open. A press on a column's head sorts by it. */
+  showBoxes() {
+    if (!$("all").open) return;
+    const { model, step } = this;
+    const kilograms = model.doc.unit_mm === null ? "" : ", kg";
+    const columns = [
+      ["box", (box, i) => i, (box, i) => `${i + 1} ${short(box.id, 40)}`],
+      ["size", (box) => box.w * box.d * box.h, (box) => [box.w, box.d, box.h].map((v) => model.length(v)).join(" × ")],
+      ["position", (box) => box.z, (box) => [box.x, box.y, box.z].map((v) => model.length(v)).join(", ")],
+      ["bin", (box) => box.bin, (box) => `${box.bin}`],
+      ["support", (box) => box.support, (box) => percent(box.support)],
+      ["margin", (box) => box.margin ?? Infinity, (box) => (box.margin === undefined ? "–" : model.length(box.margin))],
+      [`weight${kilograms}`, (box) => box.weight, (box) => plain(box.weight)],
+      [`load${kilograms}`, (box, i) => loads[i], (box, i) => plain(loads[i])],
+    ].filter(([name]) => (name !== "bin" || model.bins.length > 1) && (name !== "margin" || model.doc.colours.margin));
+    const loads = model.boxes.map((_, i) => model.load(i, step));
+    const { column, down } = this.sorting;
+    const key = (columns.find(([name]) => name === column) ?? columns[0])[1];
+    const order = model.boxes.map((_, i) => i).sort((a, b) => {
+      const [left, right] = [key(model.boxes[a], a), key(model.boxes[b], b)];
+      return (down ? -1 : 1) * (left < right ? -1 : left > right ? 1 : 0) || a - b;
+    });
+    const focused = [...$("boxes").querySelectorAll("button")].indexOf(document.activeElement);
+    fillTable($("boxes"), columns.map(([name]) => name), order.map((i) => ({
+      cells: columns.map(([, , write]) => write(model.boxes[i], i)),
+      faint: i >= step,
       press: () => {
         this.goTo(Math.max(this.step, i + 1));
         this.select(i);
       },
-    })));
-    if (this.model.doc.unit_mm === null) $("boxes").tHead.querySelector("th:last-child").textContent = "weight";
+    })), (name) => {
+      this.sorting = { column: name, down: name === column ? !down : false };
+      this.showBoxes();
+    }, this.sorting);
+    if (focused >= 0) $("boxes").querySelectorAll("button")[focused]?.focus();
   }
 
   openView() {
@@ -120,12 +145,13 @@ class Page {
     const kilograms = model.doc.unit_mm === null ? "weight" : "kg";
     fillTable($("bins"), ["bin", "boxes", "filled", "top", kilograms], rows.map((row, k) => ({
       cells: [
-        model.orders[k] ? `${k + 1} (${short(model.orders[k], 40)})` : `${k + 1}`, `${row.boxes}`,
+        model.orders[k] ? `${k} (${short(model.orders[k], 40)})` : `${k}`, `${row.boxes}`,
         percent(row.utilization, 1), model.length(row.top), plain(row.weight, 1),
       ],
       chosen: rows.length > 1 && k === model.openBin(step),
     })));
     this.showSubject();
+    this.showBoxes();
     const seen = this.view?.visible.includes(this.hovered);
     if (this.hovered >= 0 && seen) this.fillTooltip();
     else this.hover(-1);
@@ -161,7 +187,7 @@ class Page {
     $("box-heading").textContent = i < 0 ? "Box" : `Box ${i + 1}${i === this.step - 1 ? ", placed last" : ""}`;
     $("box").replaceChildren(...(i < 0 ? [element("dd", "No box is placed yet.")] : valueList(this.model.values(i, this.step))));
     this.view?.mark(i);
-    this.why.show(this.model, this.selected >= 0 ? this.selected : this.step - 1);
+    this.why.show(this.model, i);
   }
 
   select(i) {
@@ -208,7 +234,8 @@ class Page {
     }));
     const rest = this.model.last - this.step - coming.length;
     if (rest > 0) strip.append(element("p", `+ ${rest} more`));
-    if (!coming.length) strip.append(element("p", "No more boxes."));
+    const live = document.documentElement.dataset.live && !this.model.doc.closed;
+    if (!coming.length) strip.append(element("p", live ? "No box is waiting." : "No more boxes."));
   }
 
   setTheme(theme) {
@@ -217,7 +244,7 @@ class Page {
     const names = ["stage", "floor", "wire", "ink", "accent"];
     this.view?.setColours(Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()])));
     this.why.i = undefined; // its map has other colours now
-    this.why.show(this.model, this.selected >= 0 ? this.selected : this.step - 1);
+    this.why.show(this.model, this.subject);
   }
 
   toggleTheme() {
@@ -263,6 +290,7 @@ class Page {
     $("slider").addEventListener("input", () => stepTo(Number($("slider").value)));
     for (const id of ["colour", "bin"]) $(id).addEventListener("change", () => this.show());
     $("reset").addEventListener("click", () => this.view?.reset());
+    $("all").addEventListener("toggle", () => this.showBoxes());
     window.addEventListener("hashchange", () => this.readAddress());
     $("theme").addEventListener("click", () => this.toggleTheme());
     $("help").addEventListener("click", () => $("keys").showModal());

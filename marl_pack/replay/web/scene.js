@@ -100,7 +100,7 @@ class View3D {
       floor.name = "floor";
       this.labels.push(floor);
       const texts = this.shown.length > 1
-        ? [[`${k + 1}`, [x + w / 2, y - 0.8, 0]]]
+        ? [[`${k}`, [x + w / 2, y - 0.8, 0]]]
         : ["x", "y", "z"].map((axis, a) => {
             const at = [[w / 2, -0.7, 0], [w + 0.8, d / 2, 0], [-0.5, -0.3, h / 2]][a];
             return [`${axis} ${this.model.length(this.model.bins[k][a])}`, at];

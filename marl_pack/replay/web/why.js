@@ -188,8 +188,9 @@ class WhyPanel {
     }
     const dark = shade === "probabilities" ? `${LEAST} or less (each power of ten is a step)` : plain(low, 4);
     const bright = shade === "probabilities" ? 1 : plain(high, 4);
-    const range = known.length ? ` Dark: ${dark}, bright: ${bright}; grey: not computed.` : "";
-    const text = `Seen from above: where the low corner of the box may lie. Red: the ${this.moved ? "planned " : ""}box.${range}`;
+    const grey = known.length < rows.length ? "; grey: not computed" : "";
+    const range = known.length ? ` Dark: ${dark}, bright: ${bright}${grey}.` : "";
+    const text = `Seen from above: where the low corner of the box may lie. Red: the ${this.moved ? "planned " : ""}box. Lines: the boxes that were there.${range}`;
     this.parts["map-note"].textContent = text;
     map.setAttribute("aria-label", `${rows.length} legal placements from above. ${text}`);
   }
@@ -228,19 +229,27 @@ function options(select, pairs, chosen) {
 /**
  * Fill a table.
  * @param rows objects with `cells`; `chosen` marks a row; `look(on)` makes its first cell a button that is called
- * while the row has the pointer or the focus; `press` is called when it is pressed.
+ * while the row has the pointer or the focus; `press` is called when it is pressed; `faint` dims the row.
+ * @param sort called with the head of the column to sort by; @param sorting the column and the direction now.
  */
-function fillTable(table, heads, rows) {
+function fillTable(table, heads, rows, sort = null, sorting = null) {
   const head = document.createElement("tr");
   head.append(...heads.map((text) => {
-    const cell = element("th", text);
+    const cell = element("th", sort ? "" : text);
     cell.scope = "col";
+    if (sort) {
+      const button = element("button", text);
+      button.type = "button";
+      button.addEventListener("click", () => sort(text));
+      if (text === sorting.column) cell.setAttribute("aria-sort", sorting.down ? "descending" : "ascending");
+      cell.append(button);
+    }
     return cell;
   }));
   table.tHead.replaceChildren(head);
-  table.tBodies[0].replaceChildren(...rows.map(({ cells, chosen, look, press }) => {
+  table.tBodies[0].replaceChildren(...rows.map(({ cells, chosen, faint, look, press }) => {
     const row = document.createElement("tr");
-    if (chosen) row.className = "chosen";
+    row.className = chosen ? "chosen" : faint ? "faint" : "";
     cells.forEach((text, k) => {
       const cell = document.createElement("td");
       if (k === 0 && (look || press)) {
