@@ -51,9 +51,9 @@ class Heuristic:
             legal: the moves to choose among; all legal moves by default.
             lookahead: computes the afterstates; a new one by default.
         """
-        return (legal or game.moves).least(self._rank(game, lookahead))
+        return (legal or game.moves).least(self.rank(game, lookahead))
 
-    def _rank(self, game: Packing, lookahead: Lookahead | None = None) -> Tensor:
+    def rank(self, game: Packing, lookahead: Lookahead | None = None) -> Tensor:
         """Compute the keys as one number, int64 [G, 6, W, D]; the lowest is the best."""
         rank = torch.zeros_like(game.mask, dtype=torch.int64)
         for value, bound in self.keys(Candidates(game, lookahead or Lookahead())):
@@ -62,7 +62,7 @@ class Heuristic:
 
     def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
         """Return the order of the placements (:class:`marl_pack.agents.policy.Explained`)."""
-        rank = self._rank(game)
+        rank = self.rank(game)
         values = torch.full(rank.shape, torch.nan, dtype=torch.float64, device=rank.device)
         for g in range(game.n):
             legal = game.mask[g]

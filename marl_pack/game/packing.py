@@ -46,6 +46,8 @@ NO_CENTRES = np.empty((0, 2))
 """Stands for centres of mass in the middle."""
 Played = tuple[Tensor, Tensor, Tensor, Tensor]
 """Rewards, filled cells and numbers of boxes after a placement, and t, [G] each."""
+OF_SELECTION = ("buffer", "preview", "bins", "closings")
+"""Options that are fixed in this game."""
 LAST_EPISODE = 2**62
 """The largest number that an episode can have."""
 
@@ -113,6 +115,10 @@ class Packing(Copied):
             raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
         bin_option = {} if bin is None else {"bin": bin}
         self.spec = (spec or GameSpec()).with_options({**options, **bin_option})
+        if self.spec.selects:
+            raise ValueError(
+                "buffer, preview, bins, closings: need SelectionPacking (marl_pack.game.selection)"
+            )
         self.n = n = whole_number(n, "n, at least one game", 1, MOST_GAMES)
         self.auto_reset = truth_value(auto_reset, "auto_reset")
         self.checked = invariants.wanted()
@@ -237,7 +243,9 @@ class Packing(Copied):
 
     def _origin(self) -> dict[str, Tensor]:
         """Return numbers that identify the items, the options and the seed of these games."""
-        options = hashlib.blake2b(repr(self.spec.to_dict()).encode(), digest_size=7).digest()
+        # Options that this game does not have leave older states valid.
+        own = {k: v for k, v in self.spec.to_dict().items() if k not in OF_SELECTION}
+        options = hashlib.blake2b(repr(own).encode(), digest_size=7).digest()
         return {
             "items_fingerprint": torch.tensor(fingerprint(self.stream)),
             "options_fingerprint": torch.tensor(int.from_bytes(options, "little")),

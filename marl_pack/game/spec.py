@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from numbers import Integral
 from typing import Any, TypedDict
 
-from marl_pack.checks import shown, truth_value
+from marl_pack.checks import shown, truth_value, whole_number
 from marl_pack.geometry import ALL_ORIENTATIONS, check_size
 from marl_pack.option_record import (
     OptionRecord,
@@ -83,6 +83,16 @@ def _max_items(value: Any) -> int | None:
     return None if value is None else int(value)
 
 
+MOST_VISIBLE, MOST_BINS, CLOSINGS = 64, 16, 20
+"""Most boxes in a buffer and in a preview, most open bins, and closings for each open bin."""
+
+
+def _closings(value: Any) -> int | None:
+    if value is None:
+        return None
+    return whole_number(value, "closings (null for the default)", 1, 10**6)
+
+
 def _rule_name(rule: Any) -> str:
     """Return the name of a rule, given by its name or as a bound function."""
     return rule if isinstance(rule, str) else getattr(getattr(rule, "func", rule), "__name__", "?")
@@ -150,11 +160,46 @@ class GameSpec(OptionRecord):
         None, "largest number of items in a bin, 1 or more; the episode ends there; null for no "
         "limit.", _max_items, lambda most: f"at most {most} items", type=int,
     )  # fmt: skip
+    buffer: int = option(
+        1, f"number of visible boxes, any of which may be placed next, 1 to {MOST_VISIBLE}.",
+        lambda n: whole_number(n, "buffer", 1, MOST_VISIBLE), lambda n: f"buffer {n}", type=int,
+        metavar="K",
+    )  # fmt: skip
+    preview: int = option(
+        0, f"number of boxes after the visible ones that are seen, 0 to {MOST_VISIBLE}.",
+        lambda n: whole_number(n, "preview", 0, MOST_VISIBLE), lambda n: f"preview {n}", type=int,
+        metavar="P",
+    )  # fmt: skip
+    bins: int = option(
+        1, f"number of bins that are open at once, 1 to {MOST_BINS}.",
+        lambda n: whole_number(n, "bins", 1, MOST_BINS), lambda n: f"{n} open bins", type=int,
+        metavar="B",
+    )  # fmt: skip
+    closings: int | None = option(
+        None, "number of bins that are closed in an episode, 1 or more; null for 1 with one open "
+        f"bin, and {CLOSINGS} times the open bins with several.", _closings,
+        lambda n: f"{n} closings", type=int, metavar="C",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         """Check every option, and the rule with its parameters."""
         super().__post_init__()
         self.make_rule()
+
+    @property
+    def most_closings(self) -> int:
+        """Number of bins that are closed in an episode."""
+        default = 1 if self.bins == 1 else CLOSINGS * self.bins
+        return default if self.closings is None else self.closings
+
+    @property
+    def selects(self) -> bool:
+        """Whether a box or a bin is selected before it is placed, or more boxes are seen."""
+        return (self.buffer, self.preview, self.bins, self.most_closings) != (1, 0, 1, 1)
+
+    def of_one_box(self) -> GameSpec:
+        """Return the game of one visible box and one bin with the same other options."""
+        return replace(self, buffer=1, preview=0, bins=1, closings=None)
 
     def make_rule(self) -> Rule:
         """Return the stability rule with its parameters bound.
@@ -188,6 +233,10 @@ class GameOptions(TypedDict, total=False):
     beta: float
     com_offset: Sequence[float]
     max_items: int | None
+    buffer: int
+    preview: int
+    bins: int
+    closings: int | None
 
 
 document(GameSpec, " " * 8)(GameSpec)

@@ -16,6 +16,7 @@ from marl_pack.agents.afterstates.afterstates import Afterstates, afterstates_of
 from marl_pack.agents.afterstates.features import features
 from marl_pack.agents.afterstates.limits import ILLEGAL
 from marl_pack.agents.afterstates.sampled import EXACT_CELLS, sampled_afterstates
+from marl_pack.bins import Bins
 from marl_pack.game.packing import Packing
 
 T = TypeVar("T")
@@ -163,6 +164,29 @@ class Lookahead:
             return afterstates.as_map(value.float(), game.mask, ILLEGAL)
 
         return self.memo.once(game, ("afterstate_value", critic), compute)
+
+    def state_value(self, bins: Bins, game: Packing) -> Tensor:
+        """Estimate the return that is still to come from bins as they are, float32 [N].
+
+        Args:
+            bins: N bins.
+            game: a game with the stream of these bins.
+
+        Raises:
+            ValueError: if there is no critic.
+        """
+        if self.critic is None:
+            raise ValueError("the values of bins need a critic of afterstates")
+        width, depth, _ = bins.size
+        # A box without height changes nothing, so its afterstate is the bin as it is.
+        sides = torch.tensor([[[1, 1, 0]]], dtype=torch.int16, device=bins.device)
+        mask = torch.zeros(len(bins), 1, width, depth, dtype=torch.bool, device=bins.device)
+        mask[:, :, 0, 0] = True
+        code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
+        lengths = probe_lengths(*game.stream.sides)
+        after = code(bins, sides.expand(len(bins), 1, 3).contiguous(), mask, lengths)
+        rows = after.index[:, 0, 0, 0]
+        return self.critic.estimate(features(after, game.volume, rows)) * self.value_share
 
     def heightmap(self, game: Packing) -> Tensor:
         """Return a copy of the heightmaps int16 [G, W, D], which later placements do not change."""

@@ -1,0 +1,1 @@
+"""Policies for games in which a box and a bin are selected first."""
