@@ -164,6 +164,7 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     options = parser(program)
     chosen = options.parse_args(arguments)
     signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start it with it ignored
     try:
         run(chosen)
     except KeyboardInterrupt:

@@ -208,7 +208,7 @@ class Page {
     names.slice(0, NAMED).forEach((name, k) => {
       const swatch = element("span", "", "swatch");
       swatch.style.background = model.doc.palette[k % model.doc.palette.length];
-      legend.append(swatch, short(name, 40));
+      legend.append(swatch, `${short(name, 40)} `);
     });
     if (names.length > NAMED) legend.append(` + ${names.length - NAMED} more`);
     if (range) {
