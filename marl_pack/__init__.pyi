@@ -5,6 +5,7 @@ from .agents.player import Player as Player
 from .agents.player import load as load
 from .agents.policy import Policy as Policy
 from .agents.search_settings import SearchSettings as SearchSettings
+from .agents.selection.beam_settings import BeamSettings as BeamSettings
 from .bins import Bins as Bins
 from .env_aec import env as env
 from .env_aec import parallel_env as parallel_env
@@ -17,7 +18,9 @@ from .exact.policies import make_exact_policy as make_exact_policy
 from .exact.spec import ExactSpec as ExactSpec
 from .exact.stable_place import stable_place as stable_place
 from .game.packing import Packing as Packing
+from .game.selection import SelectionPacking as SelectionPacking
 from .game.spec import GameSpec as GameSpec
+from .game.spec import SelectionSpec as SelectionSpec
 from .game.turns import Outcome as Outcome
 from .geometry import ORIENTATIONS as ORIENTATIONS
 from .items import Items as Items

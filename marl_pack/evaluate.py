@@ -23,8 +23,16 @@ from rich.table import Table
 
 from marl_pack.checks import whole_number
 from marl_pack.evaluation.rollout import Rollout
-from marl_pack.evaluation.statistics import FEWEST, falls, spread, strict_equilibrium, summary
+from marl_pack.evaluation.statistics import (
+    FEWEST,
+    falls,
+    spread,
+    strict_equilibrium,
+    summary,
+    together,
+)
 from marl_pack.files import Growing, check_writable, same_plain_file, write_json
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.options import (
     GAME_NOTE,
     IN_MM,
@@ -123,7 +131,7 @@ def parser(program: str = PROGRAM) -> Parser:
             "--world mm --items boxes_mm.csv --bin-mm 1200 800 1500 --margin-mm 20",
         ),
     )  # fmt: skip
-    add_options(options)
+    add_options(options, SelectionSpec)
     add_mm_options(options)
     options.add_argument_group("episodes").add_argument(
         "--episodes", type=int,
@@ -190,6 +198,8 @@ def check_options(
     if episodes < 1 or (available and episodes > available):
         most = f" … {available}, the sequences of the file" if available else " or more"
         raise ValueError(f"--episodes {episodes}: needs 1{most}")
+    if arguments.explain and getattr(setup.spec, "selects", False):
+        raise ValueError("--explain: goes with games of one visible box and one bin")
     if arguments.explain and episodes > MOST_EXPLAINED:
         raise ValueError(
             f"--explain: needs at most {MOST_EXPLAINED} episodes, not {episodes}; use --episodes"
@@ -237,9 +247,13 @@ def evaluate_policy(
         return
     judging = bar.add_task(f"{name}: physics", total=episodes)
     judged: list[Judged] = []
-    of_all = bodies.stacks(rollout.plans, range(episodes))
-    for verdict in judge_all(of_all, processes=arguments.processes):
-        judged.append(verdict)
+    of_all = (
+        bodies.stack(plan.in_bin(k), e)
+        for e, plan in enumerate(rollout.plans) for k in range(len(plan.bin_sizes))
+    )  # fmt: skip
+    verdicts = judge_all(of_all, processes=arguments.processes)
+    for plan in rollout.plans:
+        judged.append(together([next(verdicts) for _ in range(len(plan.bin_sizes))]))
         bar.advance(judging)
         yield row | falls(judged)
     unjudged = sum(verdict.error is not None for verdict in judged)

@@ -9,6 +9,7 @@ from pathlib import Path
 from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.search_settings import SearchSettings
+from marl_pack.agents.selection.beam_settings import BeamSettings
 from marl_pack.agents.sources import check_source, path_of, resolve
 from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.game.spec import GameSpec
@@ -24,8 +25,10 @@ COMMON = frozenset(each.name for each in fields(GameSpec)) & {
     each.name for each in fields(ExactSpec)
 }
 """Options that games on cells have, too."""
+SELECTION = ("buffer", "preview", "bins", "closings")
+"""Options of games on cells in which a box and a bin are selected first."""
 ONLY_CELLS = ("sides", "bin", "margin", "mask_orientations", "com_offset", "max_items",
-              "orientation", "placement", "plan")  # fmt: skip
+              "orientation", "placement", "plan", *SELECTION)  # fmt: skip
 MM_POLICIES = ("max_contact", "linear", "dblf", "height_min", "best_fit", "random")
 """Heuristics of games in millimetres (:data:`marl_pack.exact.policies.NAMES`)."""
 IN_MM = {"margin": "margin_mm", "bin": "bin_mm", "max_items": "max_boxes"}
@@ -44,8 +47,16 @@ policy it is RS in a bin of 10 x 10 x 10 under hull_alpha. Options of the game c
 learned policy is a published model, a run's folder or a checkpoint."""
 
 
-def add_options(options: argparse.ArgumentParser) -> None:
-    """Add the options of :func:`marl_pack.players.choose` to a command."""
+def add_options(options: argparse.ArgumentParser, spec: type[GameSpec] = GameSpec) -> None:
+    """Add the options of :func:`marl_pack.players.choose` to a command.
+
+    Args:
+        options: the parser of the command.
+        spec: the record of the options of its games.
+    """
+    beam = "" if spec is GameSpec else (
+        "; with a buffer, a preview or several bins width=W,depth=D: a beam over the known boxes"
+    )  # fmt: skip
     models, learned = ", ".join(published.models()), "a run's folder or a checkpoint"
     add = options.add_argument_group("players").add_argument
     add("--policy", nargs="+", metavar="NAME",
@@ -60,7 +71,7 @@ def add_options(options: argparse.ArgumentParser) -> None:
              f"or {learned}")  # fmt: skip
     add("--plan", metavar="rollouts=K,top=M",
         help="learned agents try their M best pairs in K imagined futures before each placement; "
-             "depth=D ends each future after D items by the critic's value")  # fmt: skip
+             f"depth=D ends each future after D items by the critic's value{beam}")  # fmt: skip
     add("--symmetric", action="store_true",
         help="ask learned agents in all symmetries of the bin and take the action that is most "
              "probable on average; with --plan only to choose the pairs to try")  # fmt: skip
@@ -69,7 +80,7 @@ def add_options(options: argparse.ArgumentParser) -> None:
     add("--items", help=f"{', '.join(GENERATED)}, or a .npz, .json or .csv file")
     add("--sides", nargs=2, type=int, metavar=("SHORTEST", "LONGEST"),
         help="sides of generated items, in cells")  # fmt: skip
-    add_arguments(game, GameSpec)
+    add_arguments(game, spec)
     add("--seed", type=int, default=0,
         help="seed of generated items, random play, futures of --plan and drawn bodies "
              "(default: 0)")  # fmt: skip
@@ -142,7 +153,11 @@ def check_names(arguments: argparse.Namespace) -> None:
     ):
         if name is not None and name not in names:
             resolve(path_of(name, names))
-    if arguments.plan is not None:
+    if arguments.plan is not None and any(
+        getattr(arguments, name, None) is not None for name in SELECTION
+    ):
+        BeamSettings.parse(arguments.plan)
+    elif arguments.plan is not None:
         SearchSettings.parse(arguments.plan)
     items = arguments.items
     if items is not None and items not in GENERATED and not Path(items).is_file():

@@ -16,12 +16,16 @@ from rich.console import Console
 
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import InTurns, Policy
+from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.choosing import selection_policy_of
+from marl_pack.agents.selection.policies import SelectionPolicy
 from marl_pack.agents.sources import is_own
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, whole_number
 from marl_pack.evaluation.rollout import Rollout, batches
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameSpec
+from marl_pack.game.selection import SelectionPacking
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.geometry import Size
 from marl_pack.items import (
     DEFAULT_SIDES,
@@ -38,15 +42,23 @@ from marl_pack.terminal import announce_compiling
 class Setup:
     """The policies and the game that a command's options name."""
 
-    policies: dict[str, Policy]  # by the name of the policy's row in the table
+    policies: dict[str, Any]  # by the name of the policy's row in the table
     stream: Stream
     items: str  # a generated stream's name, or a file
     sides: tuple[int, int]  # shortest and longest side of generated items, in cells
-    spec: GameSpec
+    spec: SelectionSpec
     arguments: argparse.Namespace  # the parsed options
 
-    def game(self, n: int, first_episode: int) -> Packing:
-        """Return ``n`` games without ``auto_reset``; the first plays episode ``first_episode``."""
+    def game(self, n: int, first_episode: int) -> Any:
+        """Return ``n`` games without ``auto_reset``; the first plays episode ``first_episode``.
+
+        They are a :class:`Packing`, or a :class:`SelectionPacking` if the options ask for one.
+        """
+        if self.spec.selects:
+            return SelectionPacking(
+                n, self.stream, spec=self.spec, device=self.arguments.device,
+                seed=self.arguments.seed, first_episode=first_episode,
+            )  # fmt: skip
         return Packing(
             n, items=self.stream, spec=self.spec, device=self.arguments.device,
             seed=self.arguments.seed, first_episode=first_episode, auto_reset=False,
@@ -99,6 +111,9 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
     whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
     policies, trained = choose_policies(arguments, console)
     stream, items, sides, spec = choose_game(arguments, trained)
+    if spec.selects:
+        selecting = with_selection(policies, arguments)
+        return Setup(selecting, stream, items, sides, spec, arguments)
     if arguments.plan is not None:
         policies = with_search(policies, arguments, stream, spec.bin)
     return Setup(policies, stream, items, sides, spec, arguments)
@@ -106,14 +121,14 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
 
 def choose_game(
     arguments: argparse.Namespace, trained: dict[str, Any]
-) -> tuple[Stream, str, tuple[int, int], GameSpec]:
+) -> tuple[Stream, str, tuple[int, int], SelectionSpec]:
     """Return the item stream, its name, the sides of generated items, and the game.
 
     Args:
         arguments: the parsed options; an option that is not used is None.
         trained: the game that the first checkpoint was trained on; empty without a checkpoint.
     """
-    chosen = given_options(arguments, GameSpec)
+    chosen = given_options(arguments, SelectionSpec)
     if "rule" in chosen:  # margin and thresholds belong to the rule
         trained = trained | {"margin": None, "thresholds": None}
     items = str(trained.get("items", "rs") if arguments.items is None else arguments.items)
@@ -125,7 +140,7 @@ def choose_game(
         size = trained_size
     size, trained_size = (tuple(sides) if sides else None for sides in (size, trained_size))
     stream, bin_size = choose_stream(items, size, (low, high), trained_size)
-    spec = GameSpec.of(trained | chosen | {"bin": bin_size})
+    spec = SelectionSpec.of(trained | chosen | {"bin": bin_size})
     return stream, items, (low, high), spec
 
 
@@ -171,6 +186,36 @@ def choose_policies(
             raise ValueError(f"{source}: {error}") from None
         console.print(f"{source}: trained on {description}", soft_wrap=True)
     return policies, trained
+
+
+def with_selection(
+    policies: dict[str, Policy], arguments: argparse.Namespace
+) -> dict[str, SelectionPolicy]:
+    """Return policies for games in which a box and a bin are selected first.
+
+    A heuristic takes the best placement in any option. Learned agents take the placement that gains
+    most by their critic of afterstates; with ``--plan`` they search among the known boxes. A
+    function of the user's is called with the game as it is.
+
+    Raises:
+        ValueError: if a policy cannot play such games; says why.
+    """
+    if arguments.orientation is not None or arguments.symmetric:
+        raise ValueError(
+            "--orientation, --placement, --symmetric: go with games of one visible box and one bin"
+        )
+    settings = None if arguments.plan is None else BeamSettings.parse(arguments.plan)
+    chosen: dict[str, SelectionPolicy] = {}
+    for name, policy in policies.items():
+        searches = settings if name not in POLICIES and not is_own(name) else None
+        try:
+            selecting = selection_policy_of(policy, searches)
+        except ValueError as error:
+            raise ValueError(f"--policy {name}: {error}") from None
+        chosen[name if searches is None else f"{name}, {searches}"] = selecting
+    if settings is not None and list(chosen) == list(policies):
+        raise ValueError("--plan: needs --policy with a run's folder or checkpoint")
+    return chosen
 
 
 def with_search(

@@ -6,7 +6,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-DOCS = ("physics", "environment", "items", "many_bins", "millimetres", "packer", "stability")
+DOCS = (
+    "buffer",
+    "physics",
+    "environment",
+    "items",
+    "many_bins",
+    "millimetres",
+    "packer",
+    "stability",
+)
 PAGES = ("README.md", *(f"docs/{page}.md" for page in DOCS))
 EXAMPLES = [
     code

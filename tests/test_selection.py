@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from marl_pack import GameSpec, Packing, load
+from marl_pack import Packing, evaluate, load
 from marl_pack.agents.heuristics import HEURISTICS
 from marl_pack.agents.selection.beam import Beam, best_of_each, distinct
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.choosing import selection_policy_of
 from marl_pack.agents.selection.policies import (
     GreedyValue,
     RandomSelection,
@@ -23,7 +26,9 @@ from marl_pack.agents.selection.policies import (
 )
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.game.selection import SelectionPacking
+from marl_pack.game.spec import GameSpec, SelectionSpec
 from marl_pack.plan import Plan
+from marl_pack.plan_archive import load_plans
 
 RULES = ("hull_alpha", "lbcp", "equilibrium")
 VARIANTS = [
@@ -36,7 +41,7 @@ def game_of(n: int = 4, items: Any = "rs", **options: Any) -> SelectionPacking:
     seed, first = options.pop("seed", 0), options.pop("first_episode", 0)
     reset = options.pop("auto_reset", False)
     return SelectionPacking(
-        n, items, spec=GameSpec(**options), seed=seed, first_episode=first, auto_reset=reset
+        n, items, spec=SelectionSpec(**options), seed=seed, first_episode=first, auto_reset=reset
     )
 
 
@@ -233,7 +238,10 @@ def test_impossible_options_are_refused(options: dict[str, Any], words: str) -> 
 @pytest.mark.parametrize("options", [{"buffer": 2}, {"preview": 1}, {"bins": 2}, {"closings": 2}])
 def test_the_game_of_one_box_refuses_other_games(options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="need SelectionPacking"):
-        Packing(1, (10, 10, 10), **options)  # type: ignore[arg-type]
+        Packing(1, spec=SelectionSpec(**options))
+    with pytest.raises(ValueError, match="needs a SelectionSpec"):
+        SelectionPacking(1, spec=GameSpec())  # type: ignore[arg-type]
+    assert Packing(1, spec=SelectionSpec(closings=1)).spec == GameSpec()
 
 
 def test_copies_and_branches_do_not_share_their_state() -> None:
@@ -406,3 +414,55 @@ def test_settings_of_the_beam_are_read(text: str) -> None:
 def test_impossible_settings_of_the_beam_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"width|plan|depth"):
         BeamSettings.parse(text)
+
+
+def test_a_loaded_policy_plays_games_with_selection(greedy: GreedyValue) -> None:
+    game = game_of(3, buffer=3, bins=2)
+    for policy, expected in (
+        (load("rs"), greedy), (load("dblf"), RankedSelection(HEURISTICS["dblf"])),
+        (load("rs", search=BeamSettings(3, 2)), Beam(greedy.lookahead, BeamSettings(3, 2))),
+    ):  # fmt: skip
+        assert all(map(torch.equal, policy(game), expected(game)))
+    option, orientation, cell = load("random", seed=3)(game)
+    assert game.place(option, orientation, cell).placed.tolist() == [1, 1, 1]
+    with pytest.raises(ValueError, match="need agents with a critic of afterstates"):
+        load("plain")(game)
+    with pytest.raises(ValueError, match="a beam search needs learned agents"):
+        selection_policy_of(HEURISTICS["dblf"], BeamSettings())
+
+
+def test_evaluate_plays_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plans, figures = tmp_path / "plans.json", tmp_path / "figures.json"
+    words = ["--policy", "rs", "--items", "rs", "--episodes", "4", "--json", str(figures)]
+    selection = ["--bins", "2", "--closings", "3", "--buffer", "2"]
+    assert evaluate.main([*words, *selection, "--save-stacks", str(plans)]) == 0
+    assert "buffer 2, 2 open bins, 3 closings" in capsys.readouterr().out
+    row = json.loads(figures.read_text())["policies"]["rs"]
+    saved = load_plans(plans)
+    assert row["utilization"] == pytest.approx(np.mean([plan.utilization for plan in saved]))
+    assert [len(plan.bin_sizes) for plan in saved] == [4] * 4
+    assert row["strict_equilibrium"] == 1
+    assert evaluate.main([*words, "--buffer", "3", "--plan", "width=2,depth=2"]) == 0
+    assert "rs, width=2,depth=2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--policy", "plain", "--buffer", "2"], "plain: a buffer, a preview or several bins need"),
+     (["--policy", "dblf", "--buffer", "2", "--plan", "width=3"], "--plan: needs --policy with"),
+     (["--policy", "rs", "--buffer", "2", "--plan", "rollouts=3"], "needs width=W or depth=D"),
+     (["--policy", "rs", "--buffer", "2", "--symmetric"], "go with games of one visible box"),
+     (["--orientation", "first", "--placement", "dblf", "--bins", "2"], "go with games of one"),
+     (["--buffer", "0"], "buffer"), (["--world", "mm", "--buffer", "2"], "goes with --world cells"),
+     (["--policy", "rs", "--buffer", "2", "--explain", "--save-stacks", "p.json"],
+      "--explain: goes with games of one visible box and one bin")],
+)  # fmt: skip
+def test_what_evaluate_refuses(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main([*arguments, "--episodes", "2"])
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from pettingzoo import ParallelEnv
@@ -12,6 +13,7 @@ from torch import Tensor
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.policy import InTurns, Placement, Policy
+from marl_pack.agents.selection.beam_settings import BeamSettings
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
@@ -21,6 +23,8 @@ from marl_pack.game.packing import Packing
 
 if TYPE_CHECKING:
     from marl_pack.agents.search_settings import SearchSettings
+    from marl_pack.agents.selection.policies import SelectionPlacement, SelectionPolicy
+    from marl_pack.game.selection import SelectionPacking
 
 
 def load(
@@ -29,7 +33,7 @@ def load(
     seed: int | None = 0,
     *,
     symmetric: bool = False,
-    search: SearchSettings | None = None,
+    search: SearchSettings | BeamSettings | None = None,
 ) -> Player:
     """Return the player that ``source`` names.
 
@@ -42,7 +46,8 @@ def load(
             play uses torch's global generator.
         symmetric: whether learned agents average over the symmetries of the bin.
         search: how far learned agents search before each placement; None for no search. Future
-            items are drawn from the distribution of the items in training.
+            items are drawn from the distribution of the items in training. ``BeamSettings`` are for
+            games with a buffer, a preview or several bins.
 
     Raises:
         ValueError, FileNotFoundError: if there is no such player, or it does not support an option.
@@ -65,8 +70,10 @@ def load(
     loader = Loader(device, seed, symmetric)
     if search is None:
         return Player(loader.policy(source))
+    if isinstance(search, BeamSettings):
+        return Player(loader.policy(source), search)
     if not isinstance(search, SearchSettings):
-        raise ValueError(f"search = {shown(search)}: needs SearchSettings")
+        raise ValueError(f"search = {shown(search)}: needs SearchSettings or BeamSettings")
     checkpoint = checkpoints.read(source, device)
     try:
         futures = imagined_stream(checkpoint).to(device)
@@ -82,15 +89,34 @@ class Player:
         policy: the policy that chooses, for example from
             :meth:`marl_pack.agents.loading.Loader.policy`. If a function that you wrote has to
             choose the cell alone, its second argument is the moves to choose among.
+        search: how far learned agents search in games with selection.
     """
 
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
+    def __init__(self, policy: Policy, search: BeamSettings | None = None) -> None:
+        self.policy, self.search = policy, search
         self._agents = policy if isinstance(policy, InTurns) else _TwoTurns(policy)
 
-    def __call__(self, game: Packing) -> Placement:
-        """Return the orientation and the cell of each game's item, int64 [G] each."""
-        return self.policy(game)
+    @overload
+    def __call__(self, game: Packing) -> Placement: ...
+
+    @overload
+    def __call__(self, game: SelectionPacking) -> SelectionPlacement: ...
+
+    def __call__(self, game: Packing | SelectionPacking) -> Placement | SelectionPlacement:
+        """Return the orientation and the cell of each game's item, int64 [G] each.
+
+        In a game with selection the chosen options come first.
+        """
+        if isinstance(game, Packing):
+            return self.policy(game)
+        return self._selecting(game)
+
+    @cached_property
+    def _selecting(self) -> SelectionPolicy:
+        """The policy for games with selection."""
+        from marl_pack.agents.selection.choosing import selection_policy_of
+
+        return selection_policy_of(self.policy, self.search)
 
     def act(self, env: Any) -> Any:
         """Return the action of the agent whose turn it is, for ``env.step``.

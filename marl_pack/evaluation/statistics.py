@@ -101,6 +101,16 @@ def strict_equilibrium(plan: Plan) -> bool:
     return all(in_equilibrium(stack.boxes, stack.loads) for stack in stacks)
 
 
+def together(results: Sequence[Judged]) -> Judged:
+    """Return the results of the bins of one episode as one: something fell if it did in any bin."""
+    return Judged(
+        sum(result.placements for result in results),
+        next((result.fall for result in results if result.fall is not None), None),
+        sum(result.seconds for result in results),
+        next((result.error for result in results if result.error is not None), None),
+    )
+
+
 def falls(results: Sequence[Judged]) -> dict[str, Any]:
     """Compute the figures of packings that the physics engine has judged.
 

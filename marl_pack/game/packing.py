@@ -28,7 +28,7 @@ from marl_pack.bins import COUNT, UNKNOWN, Bins, check_device
 from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game import compiled, invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves
-from marl_pack.game.spec import GameOptions, GameSpec
+from marl_pack.game.spec import GameOptions, GameSpec, SelectionSpec
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.geometry import ALL_ORIENTATIONS, orientation_table
@@ -46,8 +46,6 @@ NO_CENTRES = np.empty((0, 2))
 """Stands for centres of mass in the middle."""
 Played = tuple[Tensor, Tensor, Tensor, Tensor]
 """Rewards, filled cells and numbers of boxes after a placement, and t, [G] each."""
-OF_SELECTION = ("buffer", "preview", "bins", "closings")
-"""Options that are fixed in this game."""
 LAST_EPISODE = 2**62
 """The largest number that an episode can have."""
 
@@ -115,10 +113,13 @@ class Packing(Copied):
             raise ValueError(f"spec = {shown(spec)}: needs a GameSpec")
         bin_option = {} if bin is None else {"bin": bin}
         self.spec = (spec or GameSpec()).with_options({**options, **bin_option})
-        if self.spec.selects:
-            raise ValueError(
-                "buffer, preview, bins, closings: need SelectionPacking (marl_pack.game.selection)"
-            )
+        if isinstance(self.spec, SelectionSpec):
+            if self.spec.selects:
+                raise ValueError(
+                    "buffer, preview, bins, closings: need SelectionPacking "
+                    "(marl_pack.game.selection)"
+                )
+            self.spec = self.spec.of_one_box()
         self.n = n = whole_number(n, "n, at least one game", 1, MOST_GAMES)
         self.auto_reset = truth_value(auto_reset, "auto_reset")
         self.checked = invariants.wanted()
@@ -146,7 +147,7 @@ class Packing(Copied):
         vars(copied).update(copy.deepcopy(vars(self), memo))
         return copied
 
-    def _most_items(self, smallest: int, longest: int | None) -> int:
+    def most_items(self, smallest: int, longest: int | None) -> int:
         """Return the most boxes that a bin can ever hold.
 
         Args:
@@ -199,7 +200,7 @@ class Packing(Copied):
                 have not changed then.
         """
         attributes = dict(vars(self))
-        most = self._most_items(self.stream.smallest, self.stream.longest)
+        most = self.most_items(self.stream.smallest, self.stream.longest)
         try:
             if seed is not None:
                 self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
@@ -220,7 +221,7 @@ class Packing(Copied):
         self.state = GameState(bins, self.stream.item(stream, t), episode, t, lost, stream)
         self._find_moves()
 
-    def _alias(self) -> Packing:
+    def alias(self) -> Packing:
         """Return games that share all attributes with these; the caller then replaces the state."""
         alias = object.__new__(type(self))
         vars(alias).update(vars(self))
@@ -243,9 +244,7 @@ class Packing(Copied):
 
     def _origin(self) -> dict[str, Tensor]:
         """Return numbers that identify the items, the options and the seed of these games."""
-        # Options that this game does not have leave older states valid.
-        own = {k: v for k, v in self.spec.to_dict().items() if k not in OF_SELECTION}
-        options = hashlib.blake2b(repr(own).encode(), digest_size=7).digest()
+        options = hashlib.blake2b(repr(self.spec.to_dict()).encode(), digest_size=7).digest()
         return {
             "items_fingerprint": torch.tensor(fingerprint(self.stream)),
             "options_fingerprint": torch.tensor(int.from_bytes(options, "little")),
@@ -280,7 +279,7 @@ class Packing(Copied):
         Raises:
             ValueError: naming the first game and tensor that are wrong.
         """
-        again, count = self._alias(), state.bins.count
+        again, count = self.alias(), state.bins.count
         again.auto_reset = again.checked = False
         beyond = (state.episode < -LAST_EPISODE) | (state.episode > LAST_EPISODE)
         refuse_where(beyond, "episode", "the number of an episode")
@@ -339,7 +338,7 @@ class Packing(Copied):
         known = self.device.type == "cpu" and len(games) > 0  # on another device this would wait
         if known and not 0 <= int(games.min()) <= int(games.max()) < self.n:
             raise ValueError(f"games: needs numbers of games from 0 to {self.n - 1}")
-        branched = self._alias()
+        branched = self.alias()
         branched.n, branched.auto_reset = len(games), False
         branched._games = torch.arange(len(games), device=self.device)
         branched.bin_height = self.bin_height[games]
@@ -351,7 +350,7 @@ class Packing(Copied):
             # A search uses negative seeds, which users may not give.
             branched.seed = whole_number(seed, "seed", -1 - LARGEST_SEED, LARGEST_SEED)
             branched.orientation_sets = _orientation_sets(stream, self.spec)
-            most = self._most_items(min(self.stream.smallest, stream.smallest), None)
+            most = self.most_items(min(self.stream.smallest, stream.smallest), None)
             branched.state.bins = branched.bins.for_boxes(most)
             if stream.id_names != self.stream.id_names:
                 branched.bins.labels[..., 0] = UNKNOWN

@@ -23,10 +23,10 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
-from marl_pack.checks import described, whole_number
+from marl_pack.checks import described, shown, whole_number
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import LAST_EPISODE, MOST_SKIPPED, Packing
-from marl_pack.game.spec import GameSpec
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.game.state import Copied, GameState
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
@@ -112,7 +112,7 @@ class SelectionPacking(Copied):
         n: int,
         items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream = "rs",
         *,
-        spec: GameSpec,
+        spec: SelectionSpec,
         sides: tuple[int, int] = DEFAULT_SIDES,
         auto_reset: bool = False,
         device: torch.device | str = "cpu",
@@ -120,10 +120,8 @@ class SelectionPacking(Copied):
         seed: int = 0,
         first_episode: int = 0,
     ) -> None:
-        if not spec.mask_orientations or any(spec.com_offset):
-            raise ValueError(
-                "buffer, bins, closings: need mask_orientations = true and no com_offset"
-            )
+        if not isinstance(spec, SelectionSpec):
+            raise ValueError(f"spec = {shown(spec)}: needs a SelectionSpec")
         self.spec, self.n, self.auto_reset = spec, whole_number(n, "n", 1), auto_reset
         self.k, self.b, self.preview = spec.buffer, spec.bins, spec.preview
         self.options = self.k * self.b
@@ -151,7 +149,7 @@ class SelectionPacking(Copied):
     def reset(self, first_episode: int = 0) -> None:
         """Begin the episodes ``first_episode + g`` with empty bins."""
         first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
-        most = self._base._most_items(self.stream.smallest, self.stream.longest)
+        most = self._base.most_items(self.stream.smallest, self.stream.longest)
         bins = bin_state.empty(self.n * self.b, self.size, most, self.device, self.backend)
         episode = self._games + first
         zeros = torch.zeros_like(episode)
@@ -223,7 +221,7 @@ class SelectionPacking(Copied):
         """
         rows = torch.arange(len(self._game_of), device=self.device) if rows is None else rows
         base, state, game = self._base, self.state, self._game_of[rows]
-        view = base._alias()
+        view = base.alias()
         view.n = len(rows)
         view._games = torch.arange(len(rows), device=self.device)
         view.bin_height = base.bin_height.expand(len(rows), 1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from numbers import Integral
 from typing import Any, TypedDict
 
@@ -19,6 +19,7 @@ from marl_pack.option_record import (
     document,
     finite_number,
     option,
+    options_of,
     reward_weight,
 )
 from marl_pack.stability import RULES, Rule, make_rule
@@ -160,6 +161,40 @@ class GameSpec(OptionRecord):
         None, "largest number of items in a bin, 1 or more; the episode ends there; null for no "
         "limit.", _max_items, lambda most: f"at most {most} items", type=int,
     )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        """Check every option, and the rule with its parameters."""
+        super().__post_init__()
+        self.make_rule()
+
+    def make_rule(self) -> Rule:
+        """Return the stability rule with its parameters bound.
+
+        Raises:
+            ValueError: for a parameter that the rule does not take.
+        """
+        bound = {"margin": self.margin, "thresholds": self.thresholds}
+        parameters = {name: value for name, value in bound.items() if value is not None}
+        if isinstance(self.rule, str):
+            return make_rule(self.rule, **parameters)
+        if parameters:
+            raise ValueError(f"{', '.join(parameters)}: needs the name of a rule, not a function")
+        rule: Rule = self.rule
+        return rule
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return name → value of all options; a bound rule is its function's name."""
+        return asdict(self) | {"rule": _rule_name(self.rule)}
+
+
+@dataclass(frozen=True)
+class SelectionSpec(GameSpec):
+    """Every option of a game in which a box and a bin may be selected first.
+
+    Args:
+        {options}
+    """
+
     buffer: int = option(
         1, f"number of visible boxes, any of which may be placed next, 1 to {MOST_VISIBLE}.",
         lambda n: whole_number(n, "buffer", 1, MOST_VISIBLE), lambda n: f"buffer {n}", type=int,
@@ -182,9 +217,12 @@ class GameSpec(OptionRecord):
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check every option, and the rule with its parameters."""
+        """Check every option, and that they go together."""
         super().__post_init__()
-        self.make_rule()
+        if self.selects and (not self.mask_orientations or any(self.com_offset)):
+            raise ValueError(
+                "buffer, preview, bins, closings: need mask_orientations = true and no com_offset"
+            )
 
     @property
     def most_closings(self) -> int:
@@ -199,26 +237,7 @@ class GameSpec(OptionRecord):
 
     def of_one_box(self) -> GameSpec:
         """Return the game of one visible box and one bin with the same other options."""
-        return replace(self, buffer=1, preview=0, bins=1, closings=None)
-
-    def make_rule(self) -> Rule:
-        """Return the stability rule with its parameters bound.
-
-        Raises:
-            ValueError: for a parameter that the rule does not take.
-        """
-        bound = {"margin": self.margin, "thresholds": self.thresholds}
-        parameters = {name: value for name, value in bound.items() if value is not None}
-        if isinstance(self.rule, str):
-            return make_rule(self.rule, **parameters)
-        if parameters:
-            raise ValueError(f"{', '.join(parameters)}: needs the name of a rule, not a function")
-        rule: Rule = self.rule
-        return rule
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return name → value of all options; a bound rule is its function's name."""
-        return asdict(self) | {"rule": _rule_name(self.rule)}
+        return GameSpec(**{each.name: getattr(self, each.name) for each in options_of(GameSpec)})
 
 
 class GameOptions(TypedDict, total=False):
@@ -233,10 +252,7 @@ class GameOptions(TypedDict, total=False):
     beta: float
     com_offset: Sequence[float]
     max_items: int | None
-    buffer: int
-    preview: int
-    bins: int
-    closings: int | None
 
 
 document(GameSpec, " " * 8)(GameSpec)
+document(SelectionSpec, " " * 8)(SelectionSpec)

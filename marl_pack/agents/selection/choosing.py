@@ -1,0 +1,71 @@
+"""Make a policy for games with selection from a policy for one box and one bin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from marl_pack.agents.afterstates.lookahead import Lookahead
+from marl_pack.agents.heuristics import Heuristic, RandomPlay
+from marl_pack.agents.policy import Policy
+from marl_pack.agents.selection.beam import Beam
+from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.policies import (
+    GreedyValue,
+    RandomSelection,
+    RankedSelection,
+    SelectionPolicy,
+)
+
+AGENTS = ("placement_agent", "orientation_agent", "agent")
+"""Attributes of policies that hold learned agents."""
+
+
+def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> SelectionPolicy:
+    """Return a policy for :class:`marl_pack.game.selection.SelectionPacking`.
+
+    A heuristic takes the best placement in any option, random play draws an option first. Learned
+    agents take the placement that gains most by their critic of afterstates, or search with it. A
+    function of the user's is returned as it is.
+
+    Args:
+        policy: a policy for games of one box and one bin, or a function of the user's.
+        search: how far to search among the known boxes; None for no search.
+
+    Raises:
+        ValueError: if the policy cannot play such games, or cannot search.
+    """
+    lookahead = _lookahead_of(policy)
+    if lookahead is not None:
+        return GreedyValue(lookahead) if search is None else Beam(lookahead, search)
+    if _is_learned(policy):
+        raise ValueError(
+            "a buffer, a preview or several bins need agents with a critic of afterstates, such as "
+            "rs"
+        )
+    if search is not None:
+        raise ValueError("a beam search needs learned agents with a critic of afterstates")
+    if isinstance(policy, Heuristic):
+        return RankedSelection(policy)
+    if isinstance(policy, RandomPlay):
+        return RandomSelection(policy, policy.generator)
+    own: Any = policy
+    return own
+
+
+def _agents(policy: Any) -> list[Any]:
+    """Return the learned agents of a policy."""
+    agents = [getattr(policy, name, None) for name in AGENTS]
+    return [agent for agent in agents if isinstance(getattr(agent, "lookahead", None), Lookahead)]
+
+
+def _is_learned(policy: Any) -> bool:
+    return bool(_agents(policy))
+
+
+def _lookahead_of(policy: Any) -> Lookahead | None:
+    """Return the lookahead of a learned policy; None if its agents have no critic."""
+    for agent in _agents(policy):
+        lookahead: Lookahead = agent.lookahead
+        if lookahead.critic is not None:
+            return lookahead
+    return None
