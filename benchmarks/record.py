@@ -37,6 +37,7 @@ PROGRAMS = {
     "two_orientations": "experiments.packing --tables two_orientations",
     "other_rules": "experiments.packing --tables other_rules",
     "bodies": "experiments.packing --tables bodies",
+    "selection": "experiments.packing --tables selection",
     **{name: f"experiments.{name}" for name in (
         "ablations", "learning_curve", "planning", "afterstates", "volume_spread",
         "real_goods", "real_cell", "packer")},

@@ -1,10 +1,11 @@
 """Measure how well policies pack: ``python -m experiments.packing``.
 
-There are four tables: ``packing`` has policies on four sets of items; ``two_orientations`` has
+There are five tables: ``packing`` has policies on four sets of items; ``two_orientations`` has
 policies that may only rotate items about the vertical; ``other_rules`` has heuristics under every
-stability rule; ``bodies`` shows what falls in physics if a rule's assumptions do not hold. Each row
-is one command ``evaluate``. With ``--physics`` the packings are judged too, which takes most of the
-time; the packings of ``bodies`` are always judged.
+stability rule; ``bodies`` shows what falls in physics if a rule's assumptions do not hold;
+``selection`` has games with a buffer, a preview and several bins. Each row is one command
+``evaluate``. With ``--physics`` the packings are judged too, which takes most of the time; the
+packings of ``bodies`` are always judged.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from marl_pack.evaluation.statistics import falls, strict_equilibrium, summary
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans, save_plans
 from marl_pack.players import Setup, choose, set_threads
-from marl_pack.sapien_check.judge import judge_all
 from marl_pack.stability import RULES
 from marl_pack.terminal import make_console, make_progress
 
@@ -77,6 +77,24 @@ TABLES = {
         )
     ],
 }
+SELECTION = {
+    "buffer": [
+        f"--policy {policy} {SETS[name]} --buffer {k}{plan}"
+        for name, policy in (("RS", "rs"), ("125 types", "types125"))
+        for k in (2, 3, 5, 10)
+        for plan in ("", " --plan width=8,depth=4")
+    ] + [f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")],
+    "preview": [
+        f"--policy rs {SETS['RS']} --preview {p} --plan width={width}"
+        for p, width in ((1, 32), (2, 32), (3, 32), (5, 8), (5, 32), (10, 32))
+    ],
+    "bins": [
+        f"--policy {policy} --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"
+        for policy in ("rs", "dblf") for b in (1, 2, 3, 4)
+    ],
+}  # fmt: skip
+"""Rows of the table ``selection`` by the option that they show."""
+TABLES["selection"] = [row for rows in SELECTION.values() for row in rows]
 PLANS_FOLDER = ROOT / "runs" / "packing"
 """The folder of the plans that are still to be judged."""
 PART = 50
@@ -118,7 +136,7 @@ def measure(
         task = bar.add_task("judged", total=episodes, completed=row.get("judged_episodes", 0))
         for first in range(row.get("judged_episodes", 0), episodes, PART):
             part = range(first, min(first + PART, episodes))
-            verdicts = falls(list(judge_all(bodies.stacks(plans, part), processes=processes)))
+            verdicts = falls(list(evaluate.judge_plans(bodies, plans, part, processes)))
             row = joined(row, verdicts)
             results.put(key, row, record(command, [arguments.seed], arguments.threads))
             bar.advance(task, len(part))

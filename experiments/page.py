@@ -233,12 +233,31 @@ def render_service(folder: Path = RESULTS) -> str:
     )  # fmt: skip
 
 
+def render_buffer(folder: Path = RESULTS) -> str:
+    """Return the text of docs/buffer.md; the arguments are those of :func:`render`."""
+    table = tables_in(folder)["selection"]
+    page = PAGE.with_name("buffer.md").read_text(encoding="utf-8")
+    for option, keys in packing.SELECTION.items():
+        lines = []
+        for key in keys:
+            row = table.row(key)
+            falls = f"{row['falls']} of {row['judged_episodes']}" if "falls" in row else "–"
+            lines.append((
+                f"`{key}`", f"{row['episodes']:,}", utilization(row), f"{row['packed']:.1f}",
+                f"{1000 * row['cpu_seconds'] / (row['episodes'] * row['packed']):.1f}", falls,
+            ))  # fmt: skip
+        head = ("`evaluate`", "episodes", "utilization %", "boxes", "ms a decision", "falls")
+        page = between(page, option, markdown_table(head, *lines))
+    return between(page, "made", f"Made by {made(table)}.")
+
+
 PAGES = {
     PAGE: render,
     PAGE.with_name("real_goods.md"): render_real_goods,
     PAGE.with_name("real_cell.md"): render_real_cell,
     PAGE.with_name("packer_results.md"): render_packer,
     PAGE.with_name("replay.md"): render_replay,
+    PAGE.with_name("buffer.md"): render_buffer,
     PAGE.with_name("service.md"): render_service,
 }
 """Every page of results, with the function that makes its text."""

@@ -46,6 +46,7 @@ from marl_pack.options import (
     check_names,
 )
 from marl_pack.physics.options import BODY_OPTIONS, add_body_options, chosen_bodies
+from marl_pack.plan import Plan
 from marl_pack.plan_archive import check_ending, save_plans
 from marl_pack.sapien_check.bodies import Bodies
 from marl_pack.sapien_check.judge import Judged, judge_all
@@ -247,18 +248,37 @@ def evaluate_policy(
         return
     judging = bar.add_task(f"{name}: physics", total=episodes)
     judged: list[Judged] = []
-    of_all = (
-        bodies.stack(plan.in_bin(k), e)
-        for e, plan in enumerate(rollout.plans) for k in range(len(plan.bin_sizes))
-    )  # fmt: skip
-    verdicts = judge_all(of_all, processes=arguments.processes)
-    for plan in rollout.plans:
-        judged.append(together([next(verdicts) for _ in range(len(plan.bin_sizes))]))
+    numbers = range(episodes)
+    for verdict in judge_plans(bodies, rollout.plans, numbers, processes=arguments.processes):
+        judged.append(verdict)
         bar.advance(judging)
         yield row | falls(judged)
     unjudged = sum(verdict.error is not None for verdict in judged)
     if unjudged:
         console.print(f"{name}: {unjudged} episodes without a verdict", soft_wrap=True)
+
+
+def judge_plans(
+    bodies: Bodies, plans: Sequence[Plan], episodes: Sequence[int], processes: int = 1
+) -> Iterator[Judged]:
+    """Judge packings in physics, bin by bin; yield one result for each episode.
+
+    Args:
+        bodies: how boxes become bodies.
+        plans: the packings of all episodes.
+        episodes: the episodes to judge.
+        processes: number of processes that judge at once.
+    """
+    verdicts = judge_all(
+        (
+            bodies.stack(plans[e].in_bin(k), e)
+            for e in episodes
+            for k in range(len(plans[e].bin_sizes))
+        ),
+        processes=processes,
+    )
+    for e in episodes:
+        yield together([next(verdicts) for _ in range(len(plans[e].bin_sizes))])
 
 
 def check_world(arguments: argparse.Namespace) -> None:
