@@ -158,6 +158,11 @@ def check_names(arguments: argparse.Namespace) -> None:
     ):
         BeamSettings.parse(arguments.plan)
     elif arguments.plan is not None:
+        if "width" in arguments.plan and hasattr(arguments, "buffer"):
+            raise ValueError(
+                f"--plan {arguments.plan}: width goes with --buffer, --preview, --bins or "
+                "--closings"
+            )
         SearchSettings.parse(arguments.plan)
     items = arguments.items
     if items is not None and items not in GENERATED and not Path(items).is_file():

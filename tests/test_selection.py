@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from marl_pack import Packing, evaluate, load
+from marl_pack import Packing, SearchSettings, evaluate, load
 from marl_pack.agents.heuristics import HEURISTICS
 from marl_pack.agents.selection.beam import Beam, best_of_each, distinct
 from marl_pack.agents.selection.beam_settings import BeamSettings
@@ -190,7 +190,59 @@ def test_a_finite_sequence_ends_the_episode() -> None:
         outcome = game.place(*policy(game))
     assert outcome.done.all()
     assert (game.state.slots >= 5).all()
-    assert [len(plan) for plan in game.plans()] == [5, 5]
+    plans = game.plans()
+    assert [len(plan) for plan in plans] == [5, 5]
+    assert game.opened.tolist() == outcome.opened.tolist() == [2, 2]
+    assert game.utilization.tolist() == pytest.approx([plan.utilization for plan in plans])
+    assert outcome.utilization.tolist() == game.utilization.tolist()
+
+
+def test_a_box_that_fits_no_empty_bin_closes_none() -> None:
+    items = [[4, 4, 4]] * 6 + [[2, 2, 8]] + [[4, 4, 4]] * 6
+    game = game_of(1, items=items, bin=(10, 10, 5), orientations=(0,), bins=2, closings=40)
+    while bool(game.alive.any()):
+        game.place(*RankedSelection(HEURISTICS["dblf"])(game))
+    assert game.opened.tolist() == [2]
+    assert int(game.state.closed[0]) == 0
+    assert len(game.plans()[0].bin_sizes) == 2
+
+
+def test_games_that_have_ended_ignore_their_choice() -> None:
+    game = game_of(2, items=[[[2, 2, 2]], [[2, 2, 2]] * 3], buffer=2)
+    zero = torch.zeros(2, dtype=torch.int64)
+    game.place(zero, zero, zero)
+    assert game.alive.tolist() == [False, True]
+    outcome = game.place(
+        torch.tensor([-7, 1]), torch.tensor([99, 0]), torch.tensor([-1, 44])
+    )  # fmt: skip
+    assert outcome.placed.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("options", [{"bins": 3, "closings": 5}, {"buffer": 3, "bins": 2}])
+def test_a_game_is_played_the_same_alone_and_in_a_batch(
+    options: dict[str, int], greedy: GreedyValue
+) -> None:
+    for policy in (greedy, Beam(greedy.lookahead, BeamSettings(2, 2))):
+        many = game_of(7, **options)
+        alone = [game_of(1, first_episode=g, **options) for g in range(7)]
+        for _ in range(12):
+            choice = policy(many)
+            for g, game in enumerate(alone):
+                own = policy(game)
+                assert [int(part[0]) for part in own] == [int(part[g]) for part in choice]
+                game.place(*own)
+            many.place(*choice)
+
+
+def test_a_view_shows_no_hidden_box() -> None:
+    game = game_of(1, buffer=2)
+    view = game.view()
+    assert (view.items.sides > 0).all()
+    view.place(*load("dblf")(view))
+    assert (view.items.sides == 0).all()
+    assert not view.alive.any()
+    copied = copy.deepcopy(game)
+    assert torch.equal(copied.view().items.sides, game.view().items.sides)
 
 
 def test_games_restart_by_themselves() -> None:
@@ -427,6 +479,16 @@ def test_a_loaded_policy_plays_games_with_selection(greedy: GreedyValue) -> None
     assert game.place(option, orientation, cell).placed.tolist() == [1, 1, 1]
     with pytest.raises(ValueError, match="need agents with a critic of afterstates"):
         load("plain")(game)
+    for source, words in (
+        (load("rs", search=SearchSettings()), "need BeamSettings, not SearchSettings"),
+        (load("rs", symmetric=True), "symmetric: goes with games of one visible box"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            source(game)
+    with pytest.raises(ValueError, match="BeamSettings go with games with selection"):
+        load("rs", search=BeamSettings())(Packing(1))
+    with pytest.raises(ValueError, match=r"needs to return .option"):
+        selection_policy_of(lambda game: game.options)(game)  # type: ignore[arg-type, return-value]
     with pytest.raises(ValueError, match="a beam search needs learned agents"):
         selection_policy_of(HEURISTICS["dblf"], BeamSettings())
 
@@ -453,6 +515,7 @@ def test_evaluate_plays_them(tmp_path: Path, capsys: pytest.CaptureFixture[str])
      (["--policy", "rs", "--buffer", "2", "--plan", "rollouts=3"], "needs width=W or depth=D"),
      (["--policy", "rs", "--buffer", "2", "--symmetric"], "go with games of one visible box"),
      (["--orientation", "first", "--placement", "dblf", "--bins", "2"], "go with games of one"),
+     (["--policy", "rs", "--plan", "width=8"], "width goes with --buffer"),
      (["--buffer", "0"], "buffer"), (["--world", "mm", "--buffer", "2"], "goes with --world cells"),
      (["--policy", "rs", "--buffer", "2", "--explain", "--save-stacks", "p.json"],
       "--explain: goes with games of one visible box and one bin")],

@@ -108,6 +108,8 @@ class Player:
         In a game with selection the chosen options come first.
         """
         if isinstance(game, Packing):
+            if self.search is not None:
+                raise ValueError("search: BeamSettings go with games with selection")
             return self.policy(game)
         return self._selecting(game)
 

@@ -113,8 +113,10 @@ def batches(
     from marl_pack.agents.explaining import explain  # slow to import
 
     episodes = whole_number(episodes, "episodes", 1)
-    width, depth, _ = game(1, 0).size
-    batch = max(1, min(BATCH, BATCH_CELLS // (width * depth)))
+    one = game(1, 0)
+    width, depth, _ = one.size
+    cells = width * depth * getattr(one, "options", 1)  # a game with selection has more
+    batch = max(1, min(BATCH, BATCH_CELLS // cells))
     for first in range(0, episodes, batch):
         games = game(min(batch, episodes - first), first)
         progress(int((~games.alive).sum()))

@@ -5,8 +5,9 @@ b bins are open. An *option* is a pair of a slot i and a bin j; its number is ``
 boxes after the visible ones are seen, too, but may not be placed yet.
 
 When no visible box has a place in any bin, the fullest bin is closed and replaced by an empty one.
-The last closing ends the episode, and replaces nothing. With k = b = 1 and one closing this is the
-game of :class:`marl_pack.game.packing.Packing`, action by action.
+The last closing ends the episode, and replaces nothing. The episode also ends when the sequence
+does, and when no visible box would have a place in an empty bin. With k = b = 1 and one closing
+this is the game of :class:`marl_pack.game.packing.Packing`, action by action.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
-from marl_pack.checks import described, shown, whole_number
+from marl_pack.checks import described, shown, truth_value, whole_number
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import LAST_EPISODE, MOST_SKIPPED, Packing
 from marl_pack.game.spec import SelectionSpec
@@ -49,6 +50,7 @@ class SelectionState:
     episode: Tensor  # int64 [G]    number of the episode
     stream: Tensor  # [G, …]        state of the item stream in each episode
     closed: Tensor  # int64 [G]     bins closed so far
+    opened: Tensor  # int64 [G]     bins opened so far
     packed: Tensor  # int64 [G]     cells filled in all bins, closed ones included
     placed: Tensor  # int64 [G]     boxes in all bins, closed ones included
     ended: Tensor  # bool [G]       whether the episode has ended
@@ -79,6 +81,27 @@ class SelectionOutcome:
     def utilization(self) -> Tensor:
         """Share of the volume of all opened bins that is filled, float64 [G]."""
         return self.packed.double() / (self.opened * self.volume)
+
+
+class NothingMore:
+    """A stream that describes the boxes of another stream, and brings none.
+
+    Args:
+        stream: the other stream.
+    """
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "stream":  # a copy that is still empty
+            raise AttributeError(name)
+        return getattr(self.stream, name)
+
+    def item(self, state: Tensor, t: Tensor) -> Items:
+        """Return no items: zero sides [N]."""
+        items = self.stream.item(state, t)
+        return replace(items, sides=torch.zeros_like(items.sides))
 
 
 class SelectionPacking(Copied):
@@ -122,7 +145,9 @@ class SelectionPacking(Copied):
     ) -> None:
         if not isinstance(spec, SelectionSpec):
             raise ValueError(f"spec = {shown(spec)}: needs a SelectionSpec")
-        self.spec, self.n, self.auto_reset = spec, whole_number(n, "n", 1), auto_reset
+        self.spec, self.n = spec, whole_number(n, "n", 1)
+        self.auto_reset = truth_value(auto_reset, "auto_reset")
+        self.searching = False  # whether games end where a bin would be closed
         self.k, self.b, self.preview = spec.buffer, spec.bins, spec.preview
         self.options = self.k * self.b
         # What all options share: the rule, the stream and its tables.
@@ -134,6 +159,7 @@ class SelectionPacking(Copied):
         self.stream, self.size, self.volume = base.stream, base.size, base.volume
         self.floor, self.device, self.backend = base.floor, base.device, base.backend
         self.seed = base.seed
+        self._nothing_more: Any = NothingMore(self.stream)
         self._number()
         self.reset(first_episode)
 
@@ -157,7 +183,7 @@ class SelectionPacking(Copied):
         self.state = SelectionState(
             bins, torch.arange(self.k, device=self.device).repeat(self.n, 1), zeros + self.k,
             zeros + EVERYTHING, episode, self.stream.start(self.seed, episode), zeros.clone(),
-            zeros.clone(), zeros.clone(), zeros.bool(),
+            zeros + self.b, zeros.clone(), zeros.clone(), zeros.bool(),
             torch.zeros(shape, dtype=torch.bool, device=self.device),
         )  # fmt: skip
         self.closed_plans: list[list[Plan]] = [[] for _ in range(self.n)]
@@ -180,9 +206,8 @@ class SelectionPacking(Copied):
 
     @property
     def opened(self) -> Tensor:
-        """Bins opened in each episode so far, int64 [G]; the last closing opens none."""
-        closed = self.state.closed
-        return self.b + closed.clamp(max=self.spec.most_closings - 1)
+        """Bins opened in each episode so far, int64 [G]."""
+        return self.state.opened
 
     @property
     def utilization(self) -> Tensor:
@@ -214,7 +239,8 @@ class SelectionPacking(Copied):
     def view(self, rows: Tensor | None = None) -> Packing:
         """Return options as games of one box and one bin, which policies for such games can play.
 
-        The view has copies: placing a box in it changes nothing here.
+        The view has copies: placing a box in it changes nothing here. Its stream brings no further
+        box, so a policy that looks ahead with it sees nothing that is hidden.
 
         Args:
             rows: int64 [R], numbers ``game · (k · b) + option``; by default all, in order.
@@ -222,6 +248,7 @@ class SelectionPacking(Copied):
         rows = torch.arange(len(self._game_of), device=self.device) if rows is None else rows
         base, state, game = self._base, self.state, self._game_of[rows]
         view = base.alias()
+        view.stream = self._nothing_more
         view.n = len(rows)
         view._games = torch.arange(len(rows), device=self.device)
         view.bin_height = base.bin_height.expand(len(rows), 1)
@@ -270,6 +297,10 @@ class SelectionPacking(Copied):
         alive = self.alive
         if check:
             self._check(selection, orientation, cell)
+        # Games that have ended ignore their choice.
+        selection, orientation, cell = (
+            torch.where(alive, choice, 0) for choice in (selection, orientation, cell)
+        )
         state, rows = self.state, self.rows(selection)
         bins, slot = self.bin_of[rows], (selection // self.b)[:, None]
         items = self.items(rows)
@@ -360,15 +391,19 @@ class SelectionPacking(Copied):
         """Close the fullest bin of the games in which no box has a place, until one has."""
         while bool((stuck := ~self.alive & ~self.state.ended).any()):
             state = self.state
-            filled = state.bins.filled.view(self.n, self.b)
-            fullest = filled.argmax(1)
-            present = (self.items().sides[:, 0] > 0).view(self.n, -1).any(1)
-            state.closed = state.closed + stuck.long()
-            # A box that has no place in an empty bin never has one.
-            hopeless = ~present | (filled.gather(1, fullest[:, None]).squeeze(1) == 0)
-            over = stuck & (hopeless | (state.closed >= self.spec.most_closings))
+            if self.searching:
+                state.ended = state.ended | stuck
+                self._find(self._games[:0])
+                return
+            hopeless = stuck & ~self._any_fits(stuck)
+            closing = stuck & ~hopeless
+            state.closed = state.closed + closing.long()
+            over = hopeless | (closing & (state.closed >= self.spec.most_closings))
             state.ended = state.ended | over
-            again = (stuck & ~over).nonzero().squeeze(1)
+            replaced = closing & ~over
+            state.opened = state.opened + replaced.long()
+            fullest = state.bins.filled.view(self.n, self.b).argmax(1)
+            again = replaced.nonzero().squeeze(1)
             closed = again * self.b + fullest[again]
             names = self.stream.id_names
             for g, row in zip(again.tolist(), closed.tolist(), strict=True):
@@ -380,6 +415,18 @@ class SelectionPacking(Copied):
             bin_state.clear(state.bins, which)
             self._find(which[self.bin_of].nonzero().squeeze(1))
 
+    def _any_fits(self, games: Tensor) -> Tensor:
+        """Return whether a visible box has a place in an empty bin, bool [G]; false elsewhere.
+
+        A box that has none there never has one.
+        """
+        which = (games[self._game_of] & (self.bin_of % self.b == 0)).nonzero().squeeze(1)
+        items = self.items(which)
+        empty = bin_state.empty(len(which), self.size, 0, self.device, self.backend)
+        fits = torch.zeros(self.n, dtype=torch.bool, device=self.device)
+        fits[self._game_of[which][self._base.legal.moves(empty, items).any()]] = True
+        return fits
+
     def _restart(self, ended: Tensor) -> None:
         """Begin the next episode in games, bool [G]; skip episodes without a first placement."""
         for _ in range(MOST_SKIPPED):
@@ -390,7 +437,9 @@ class SelectionPacking(Copied):
             state.stream = self.stream.restart(state.stream, self.seed, state.episode, ended)
             first = torch.arange(self.k, device=self.device)
             state.slots = torch.where(ended[:, None], first, state.slots)
-            for name, value in (("t", self.k), ("closed", 0), ("packed", 0), ("placed", 0)):
+            for name, value in (
+                ("t", self.k), ("closed", 0), ("opened", self.b), ("packed", 0), ("placed", 0)
+            ):  # fmt: skip
                 setattr(state, name, getattr(state, name).masked_fill(ended, value))
             state.ended = state.ended & ~ended
             bin_state.clear(state.bins, ended.repeat_interleave(self.b))
@@ -407,11 +456,12 @@ class SelectionPacking(Copied):
         Args:
             games: int64 [K], numbers of the games to copy; a number may occur several times.
             only_known: whether the conveyor brings only the boxes of the preview; after them,
-                slots stay empty. So a search cannot foresee.
+                slots stay empty. So a search cannot foresee. Games end where a bin would be closed.
         """
         branched = object.__new__(type(self))
         vars(branched).update(vars(self))
         branched.n, branched.auto_reset = len(games), False
+        branched.searching = self.searching or only_known
         branched.state = self.state.select(games)
         if only_known:
             limit = branched.state.t + self.preview

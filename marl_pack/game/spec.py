@@ -213,7 +213,7 @@ class SelectionSpec(GameSpec):
     closings: int | None = option(
         None, "number of bins that are closed in an episode, 1 or more; null for 1 with one open "
         f"bin, and {CLOSINGS} times the open bins with several.", _closings,
-        lambda n: f"{n} closings", type=int, metavar="C",
+        lambda n: f"{n} closing{'s' * (n > 1)}", type=int, metavar="C",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

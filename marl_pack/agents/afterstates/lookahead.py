@@ -185,8 +185,13 @@ class Lookahead:
         code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
         lengths = probe_lengths(*game.stream.sides)
         after = code(bins, sides.expand(len(bins), 1, 3).contiguous(), mask, lengths)
-        rows = after.index[:, 0, 0, 0]
-        return self.critic.estimate(features(after, game.volume, rows)) * self.value_share
+        count = len(after.volume)
+        rows = torch.arange(-(-count // MULTIPLE) * MULTIPLE, device=bins.device)
+        values = torch.cat([
+            self.critic.estimate(features(after, game.volume, part.clamp(max=count - 1)))
+            for part in torch.split(rows, AT_ONCE[bins.device.type])
+        ])  # fmt: skip
+        return values[after.index[:, 0, 0, 0]] * self.value_share
 
     def heightmap(self, game: Packing) -> Tensor:
         """Return a copy of the heightmaps int16 [G, W, D], which later placements do not change."""

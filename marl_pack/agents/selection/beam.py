@@ -4,8 +4,8 @@
    node tries all its placements. The best ones by return so far plus the critic's value of the
    afterstate are carried out.
 2. Nodes that reach the same state in another order are merged.
-3. A node ends when the known boxes are placed, or none of them has a place. If the order is fixed
-   and the next known box has no place, the episode ends there, so nothing more is expected.
+3. A node ends when the known boxes are placed, or none of them has a place. If its slots are full
+   then, a bin is closed, and nothing more is expected of this bin.
 4. The search takes the first placement of the best node. Nothing beyond the known boxes is drawn or
    looked up: the critic stands for it.
 """
@@ -112,15 +112,19 @@ class Beam:
     def _final(self, nodes: _Nodes) -> Tensor:
         """Return the value of nodes that end, float64 [N].
 
-        A node whose slots are full, and that has no place left, is the end of its episode: nothing
-        more comes there, so the expected value of its bins does not count.
+        A node whose slots are full, and that has no place left, closes its fullest bin, so what was
+        expected of this bin does not count. At the last closing that holds for all bins.
         """
-        over = nodes.games.state.ended & (nodes.games.state.slots >= 0).all(1)
+        games, state = nodes.games, nodes.games.state
+        over = state.ended & (state.slots >= 0).all(1)
         value = nodes.gain.clone()
         if bool(over.any()):
-            view = nodes.games.view()
-            expected = self.lookahead.state_value(nodes.games.bins, view).double()
-            value -= torch.where(over, expected.view(len(over), -1).sum(1), 0.0)
+            expected = self.lookahead.state_value(games.bins, games.view()).double()
+            expected = expected.view(len(over), -1)
+            fullest = state.bins.filled.view(len(over), -1).argmax(1, keepdim=True)
+            last = state.closed + 1 >= games.spec.most_closings
+            lost = torch.where(last, expected.sum(1), expected.gather(1, fullest).squeeze(1))
+            value -= torch.where(over, lost, 0.0)
         return value
 
 

@@ -15,7 +15,7 @@ MOST_WIDTH = 1024
 """Largest number of nodes at each depth."""
 MOST_DEPTH = 64
 """Largest number of boxes to place in a search."""
-NEEDS = "needs width=W or depth=D"
+NEEDS = "a beam over known boxes needs width=W or depth=D"
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class BeamSettings:
     """
 
     width: int = 8
-    depth: int | None = 4
+    depth: int | None = None
 
     def __post_init__(self) -> None:
         whole_number(self.width, "width", 1, MOST_WIDTH)

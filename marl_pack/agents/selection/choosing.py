@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import Heuristic, RandomPlay
 from marl_pack.agents.policy import Policy
+from marl_pack.agents.search import Planner
 from marl_pack.agents.selection.beam import Beam
 from marl_pack.agents.selection.beam_settings import BeamSettings
 from marl_pack.agents.selection.policies import (
     GreedyValue,
     RandomSelection,
     RankedSelection,
+    SelectionPlacement,
     SelectionPolicy,
 )
+from marl_pack.game.selection import SelectionPacking
 
 AGENTS = ("placement_agent", "orientation_agent", "agent")
 """Attributes of policies that hold learned agents."""
@@ -34,6 +38,10 @@ def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> S
     Raises:
         ValueError: if the policy cannot play such games, or cannot search.
     """
+    if isinstance(policy, Planner):
+        raise ValueError("search: games with selection need BeamSettings, not SearchSettings")
+    if any(agent.symmetric for agent in _agents(policy)):
+        raise ValueError("symmetric: goes with games of one visible box and one bin")
     lookahead = _lookahead_of(policy)
     if lookahead is not None:
         return GreedyValue(lookahead) if search is None else Beam(lookahead, search)
@@ -48,8 +56,30 @@ def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> S
         return RankedSelection(policy)
     if isinstance(policy, RandomPlay):
         return RandomSelection(policy, policy.generator)
-    own: Any = policy
-    return own
+    return OwnSelection(policy)
+
+
+@dataclass(frozen=True)
+class OwnSelection:
+    """A function of the user's, whose result is checked.
+
+    Args:
+        function: ``game -> (option, orientation, cell)``.
+    """
+
+    function: Any
+
+    def __call__(self, game: SelectionPacking) -> SelectionPlacement:
+        """Return what the function chooses.
+
+        Raises:
+            ValueError: unless there are three choices.
+        """
+        choice = self.function(game)
+        if not isinstance(choice, tuple | list) or len(choice) != 3:
+            raise ValueError("the policy needs to return (option, orientation, cell)")
+        option, orientation, cell = choice
+        return option, orientation, cell
 
 
 def _agents(policy: Any) -> list[Any]:
