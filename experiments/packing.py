@@ -77,15 +77,16 @@ TABLES = {
         )
     ],
 }
+TYPES = "--items rs --sides 1 5 --seed 0"
 SELECTION = {
     "buffer": [
-        f"--policy {policy} {SETS[name]} --buffer {k}{plan}"
-        for name, policy in (("RS", "rs"), ("125 types", "types125"))
+        f"--policy {policy} {items} --buffer {k}{plan}"
+        for policy, items in (("rs", SETS["RS"]), ("types125", TYPES))
         for k in (2, 3, 5, 10)
-        for plan in ("", " --plan width=8,depth=4")
+        for plan in (" --episodes 2100", " --episodes 500 --plan width=8,depth=4")
     ] + [f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")],
     "preview": [
-        f"--policy rs {SETS['RS']} --preview {p} --plan width={width}"
+        f"--policy rs {SETS['RS']} --episodes 500 --preview {p} --plan width={width}"
         for p, width in ((1, 32), (2, 32), (3, 32), (5, 8), (5, 32), (10, 32))
     ],
     "bins": [
