@@ -78,16 +78,23 @@ TABLES = {
     ],
 }
 TYPES = "--items rs --sides 1 5 --seed 0"
+BEAM = "--plan width=8,depth=4"
 SELECTION = {
     "buffer": [
-        f"--policy {policy} {items} --buffer {k}{plan}"
-        for policy, items in (("rs", SETS["RS"]), ("types125", TYPES))
-        for k in (2, 3, 5, 10)
-        for plan in (" --episodes 2100", " --episodes 500 --plan width=8,depth=4")
-    ] + [f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")],
+        *(f"--policy rs {SETS['RS']} --buffer {k} --episodes 2100" for k in (2, 3, 5, 10)),
+        *(f"--policy rs {SETS['RS']} --buffer {k} --episodes {n} {BEAM}"
+          for k, n in ((2, 500), (3, 500), (5, 500), (10, 100))),
+        *(f"--policy types125 {TYPES} --buffer {k} --episodes {n}"
+          for k, n in ((2, 2100), (3, 2100), (5, 1000), (10, 500))),
+        *(f"--policy types125 {TYPES} --buffer {k} --episodes {n} {BEAM}"
+          for k, n in ((2, 500), (5, 100), (10, 100))),
+        *(f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")),
+    ],
     "preview": [
-        f"--policy rs {SETS['RS']} --episodes 500 --preview {p} --plan width={width}"
-        for p, width in ((1, 32), (2, 32), (3, 32), (5, 8), (5, 32), (10, 32))
+        f"--policy rs {SETS['RS']} --episodes {n} --preview {p} --plan width={width}"
+        for p, width, n in (
+            (1, 32, 500), (2, 32, 500), (3, 32, 500), (5, 8, 500), (5, 32, 200), (10, 32, 100)
+        )
     ],
     "bins": [
         f"--policy {policy} --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"
