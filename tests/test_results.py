@@ -40,7 +40,7 @@ def test_a_row_of_packings_goes_on_where_its_judgement_was_stopped(
     pytest.importorskip("sapien")
     key = "--policy random --items rs --rule none --episodes 12 --seed 0"
     results, verdicts = Results("packing", tmp_path), iter(range(2))
-    judge = packing.judge_all
+    judge = evaluate.judge_plans
 
     def killed(*arguments: Any, **options: Any) -> Any:
         if next(verdicts) == 1:
@@ -48,11 +48,11 @@ def test_a_row_of_packings_goes_on_where_its_judgement_was_stopped(
         return judge(*arguments, **options)
 
     monkeypatch.setattr(packing, "PART", 5)
-    monkeypatch.setattr(packing, "judge_all", killed)
+    monkeypatch.setattr(evaluate, "judge_plans", killed)
     with pytest.raises(KeyboardInterrupt):
         packing.measure(results, key, physics=True, plans_folder=tmp_path)
     assert results.row(key)["judged_episodes"] == 5
-    monkeypatch.setattr(packing, "judge_all", judge)
+    monkeypatch.setattr(evaluate, "judge_plans", judge)
     packing.measure(results, key, physics=True, plans_folder=tmp_path)
     evaluate.main([*key.split(), "--physics", "--json", str(tmp_path / "whole.json")])
     [whole] = json.loads((tmp_path / "whole.json").read_text("utf-8"))["policies"].values()
