@@ -302,8 +302,9 @@ def test_values_follow_the_step_and_the_bin(open_page, orders) -> None:
     page.select_option("#bin", "1")
     page.locator("#best tbody tr").nth(1).hover()
     assert page.evaluate("page.view.ghost.geometry.drawRange.count") == 24
-    page.keyboard.press("ArrowLeft")
-    assert page.evaluate("page.view.ghost.geometry.drawRange.count") == 0
+    # The outline of the step before is gone at once; a row under the pointer may show its own.
+    count = "page.view.ghost.geometry.drawRange.count"
+    assert page.evaluate(f"(() => {{ page.goTo(page.step - 1); return {count}; }})()") == 0
     page.locator("details summary").click()
     page.locator("#boxes tbody button").first.click()
     assert page.locator("#bin").input_value() == "0"  # the box that was chosen is there
