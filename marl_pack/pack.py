@@ -19,9 +19,9 @@ from marl_pack.files import check_writable
 from marl_pack.option_record import add_arguments
 from marl_pack.options import MM_POLICIES, NEXT_BIN, NO_PLACE, add_explain, check_explain
 from marl_pack.plan_archive import check_ending
+from marl_pack.render.choices import ENDINGS
 from marl_pack.terminal import Parser, announce_compiling, make_console
 
-PICTURES = (".png", ".gif", ".mp4")
 PROGRAM = "python -m marl_pack.pack"
 NOTE = """\
 columns of a file, keys of a line: w_mm, d_mm, h_mm; and, if you like, id, quantity, weight_kg,
@@ -110,8 +110,8 @@ def run(chosen: argparse.Namespace) -> int:
         check_ending(chosen.out, "--out")
     if chosen.explain:
         check_explain(chosen.out, "--out")
-    if chosen.picture is not None and chosen.picture.suffix.lower() not in PICTURES:
-        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(PICTURES)}")
+    if chosen.picture is not None and chosen.picture.suffix.lower() not in ENDINGS:
+        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(ENDINGS)}")
     for path in (chosen.out, chosen.state, chosen.picture):
         if path is not None:
             check_writable(path)

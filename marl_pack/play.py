@@ -21,10 +21,10 @@ from marl_pack.geometry import ORIENTATIONS
 from marl_pack.options import GAME_NOTE, add_explain, add_options, check_explain, check_names
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import check_ending, save_plan
+from marl_pack.render.choices import ENDINGS
 from marl_pack.terminal import Parser, make_console, make_status
 
 PROGRAM = "python -m marl_pack.play"
-PICTURES = (".png", ".gif", ".mp4")
 
 
 def parser(program: str = PROGRAM) -> Parser:
@@ -58,8 +58,8 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     Raises:
         ValueError, FileNotFoundError: if an option is impossible; says what would be right.
     """
-    if chosen.picture.suffix.lower() not in PICTURES:
-        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(PICTURES)}")
+    if chosen.picture.suffix.lower() not in ENDINGS:
+        raise ValueError(f"--picture {chosen.picture}: needs the ending {', '.join(ENDINGS)}")
     check_writable(chosen.picture)
     if chosen.save is not None:
         check_ending(chosen.save, "--save")

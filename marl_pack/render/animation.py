@@ -13,6 +13,7 @@ from PIL import Image
 from marl_pack.extras import missing
 from marl_pack.files import moved_into_place
 from marl_pack.plan import Plan
+from marl_pack.render.choices import ENDINGS
 from marl_pack.render.colours import PALETTE, colour_plan
 from marl_pack.render.picture import draw, draw_plan, drawable
 
@@ -31,8 +32,6 @@ LONGEST_TITLE = 60
 """Characters of a title; the rest of a longer one is left out."""
 SAMPLES = 12
 """Frames from which the palette of a GIF is made."""
-ENDINGS = (".png", ".gif", ".mp4")
-"""Endings of files that :func:`save_film` writes."""
 
 Frame = NDArray[np.uint8]
 

@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from marl_pack.plan import Plan
+from marl_pack.render.choices import COLOURINGS as COLOURINGS
 
 PALETTE: tuple[str, ...] = (
     "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f",
@@ -21,8 +22,6 @@ SCALE: tuple[str, ...] = tuple(to_hex(c) for c in colormaps["viridis"](np.linspa
 """Colours from the lowest number to the highest one."""
 UNKNOWN = "#9aa1a9"
 """Colour of a box whose value is unknown."""
-COLOURINGS = ("item", "size", "order", "bin", "weight", "margin")
-"""What colours can show; boxes of the same size have the same three sides, in any order."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,12 @@ from marl_pack.checks import real_number, whole_number
 from marl_pack.files import check_writable, write_atomically
 from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans
+from marl_pack.render.choices import COLOURINGS, ENDINGS
 from marl_pack.terminal import Parser, make_console, make_progress
 
 PROGRAM = "python -m marl_pack.replay"
 PAGE = ".html"
-PICTURES = (".png", ".gif", ".mp4")
 ONLY_PICTURES = ("step", "seconds", "pixels", "colour")
-COLOURINGS = ("item", "size", "order", "bin", "weight", "margin")
 LEAST_PIXELS, MOST_PIXELS = 160, 4096
 SHORTEST, LONGEST = 0.05, 60.0
 """Limits of ``--seconds``."""
@@ -67,12 +66,12 @@ def check(chosen: argparse.Namespace) -> None:
         ValueError, OSError: naming the option and what would be right.
     """
     ending = chosen.out.suffix.lower()
-    if ending not in (PAGE, *PICTURES):
-        raise ValueError(f"--out {chosen.out}: needs the ending {', '.join((PAGE, *PICTURES))}")
+    if ending not in (PAGE, *ENDINGS):
+        raise ValueError(f"--out {chosen.out}: needs the ending {', '.join((PAGE, *ENDINGS))}")
     if ending == PAGE:
         given = [name for name in ONLY_PICTURES if getattr(chosen, name) is not None]
         if given:
-            raise ValueError(f"--{given[0]}: goes with {', '.join(PICTURES)}, not with a page")
+            raise ValueError(f"--{given[0]}: goes with {', '.join(ENDINGS)}, not with a page")
     elif chosen.open:
         raise ValueError(f"--open: goes with a page ({PAGE})")
     if chosen.step is not None and ending != ".png":
