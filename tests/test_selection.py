@@ -27,7 +27,6 @@ from marl_pack.agents.selection.policies import (
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.game.selection import SelectionPacking
 from marl_pack.game.spec import GameSpec, SelectionSpec
-from marl_pack.plan import Plan
 from marl_pack.plan_archive import load_plans
 
 RULES = ("hull_alpha", "lbcp", "equilibrium")
@@ -108,13 +107,15 @@ def test_every_variant_is_played_to_its_end(options: dict[str, Any]) -> None:
     assert shown >= 8
 
 
-def slow_play(items: list[list[int]], k: int, b: int, closings: int, seed: int) -> Plan:
+def slow_play(
+    items: list[list[int]], k: int, b: int, closings: int, seed: int
+) -> list[list[tuple[int, int, int]]]:
     """The rules in a few lines: one game, lists in place of tensors, hull_alpha by ``Packing``."""
     generator = np.random.default_rng(seed)
     queue = list(range(len(items)))
     slots = [queue.pop(0) for _ in range(min(k, len(queue)))]
     bins: list[list[tuple[int, int, int]]] = [[] for _ in range(b)]
-    finished: list[Plan] = []
+    finished: list[list[tuple[int, int, int]]] = []
 
     def after(moves: list[tuple[int, int, int]], item: int | None) -> Packing:
         order = [m[0] for m in moves] + ([] if item is None else [item])
@@ -143,8 +144,8 @@ def slow_play(items: list[list[int]], k: int, b: int, closings: int, seed: int) 
         fullest = int(np.argmax(volumes))
         closings -= 1
         if closings == 0 or volumes[fullest] == 0 or not slots:
-            return [*finished, *bins]  # type: ignore[return-value]
-        finished.append(bins[fullest])  # type: ignore[arg-type]
+            return [*finished, *bins]
+        finished.append(bins[fullest])
         bins[fullest] = []
 
 
@@ -292,7 +293,7 @@ def test_the_game_of_one_box_refuses_other_games(options: dict[str, int]) -> Non
     with pytest.raises(ValueError, match="need SelectionPacking"):
         Packing(1, spec=SelectionSpec(**options))
     with pytest.raises(ValueError, match="needs a SelectionSpec"):
-        SelectionPacking(1, spec=GameSpec())  # type: ignore[arg-type]
+        SelectionPacking(1, spec=GameSpec())  # type: ignore[arg-type]  # it is refused
     assert Packing(1, spec=SelectionSpec(closings=1)).spec == GameSpec()
 
 

@@ -380,7 +380,7 @@ def test_nobody_waits_while_a_policy_thinks_except_for_its_own_bin(tmp_path: Pat
     with client_of(tmp_path / "a.sqlite", policies=(slow,)) as client:
         done(client.post("/bins", json={"id": "slow", "policy": slow}), 201)
         done(client.post("/bins", json={"id": "fast"}), 201)
-        bin = client.service._bin("slow")  # type: ignore[attr-defined]
+        bin = client.service._bin("slow")  # type: ignore[attr-defined]  # as in client_of
         with ThreadPoolExecutor(8) as pool:
             try:
                 waiting = []
@@ -420,7 +420,7 @@ def test_bins_come_back_from_the_file(tmp_path: Path) -> None:
         done(client.post("/bins/b/close"))
         urls = [f"/bins/{id}{page}" for id in "ab" for page in ("", "/plan")] + ["/bins"]
         before = [done(client.get(url)) for url in urls]
-        assert len(client.service._bins) <= 2  # type: ignore[attr-defined]
+        assert len(client.service._bins) <= 2  # type: ignore[attr-defined]  # as in client_of
     with client_of(path) as client:
         assert [done(client.get(url)) for url in urls] == before
         assert done(client.post("/bins/a/place", json=box, headers=keyed("5")))["step"] == 6
@@ -436,7 +436,7 @@ def test_a_full_disk_changes_nothing(tmp_path: Path) -> None:
     with client_of(tmp_path / "a.sqlite") as client:
         done(client.post("/bins", json={"id": "a"}), 201)
         done(client.post("/bins/a/place", json={"sides": [400, 300, 250]}))
-        file = client.service.store._file  # type: ignore[attr-defined]
+        file = client.service.store._file  # type: ignore[attr-defined]  # as in client_of
         (pages,) = file.execute("PRAGMA page_count").fetchone()
         file.execute(f"PRAGMA max_page_count = {pages}")
         box = {"sides": [300, 200, 100], "id": 200 * "x"}
