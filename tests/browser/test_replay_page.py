@@ -235,6 +235,7 @@ def test_the_table_has_all_values_and_sorts(open_page, orders) -> None:
     plan, url = orders
     page = open_page(url)
     page.locator("details summary").click()
+    page.locator("#boxes th").first.wait_for()  # the table is written after it is opened
     heads = [head.removesuffix(" ↑") for head in page.locator("#boxes th").all_inner_texts()]
     assert heads == [
         "box",
