@@ -10,12 +10,12 @@ from typing import Any
 
 from docstring_parser import parse
 
-from marl_pack import env_aec
+from marl_pack import env_aec, env_selection
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES
 from marl_pack.exact.features import FEATURES
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.export import OUTPUTS, example
-from marl_pack.game.spec import GameSpec
+from marl_pack.game.spec import SelectionSpec
 
 DOCS = Path(__file__).parent
 
@@ -73,23 +73,40 @@ def environment_arguments() -> str:
         for function in (env_aec.env, env_aec.raw_env)
         for name, parameter in inspect.signature(function).parameters.items()
     }
-    options = {option.name: option.metadata["sentence"] for option in fields(GameSpec)}
+    options = {option.name: option.metadata["sentence"] for option in fields(SelectionSpec)}
     own = arguments_of(env_aec.raw_env) | arguments_of(env_aec.env)
     rows = [("argument", "default", "")]
     for name, sentence in own.items():
         if name in defaults and name not in options:
             rows.append((f"`{name}`", f"`{defaults[name]!r}`", sentence))
     options_rows = [("option", "default", "")]
-    for option in fields(GameSpec):
+    for option in fields(SelectionSpec):
         if option.name in defaults:
             sentence = options[option.name].replace("null", "None")
             options_rows.append((f"`{option.name}`", f"`{option.default!r}`", sentence))
     return f"{table(*rows)}\n\n{table(*options_rows)}"
 
 
+def text_of(module: Any) -> str:
+    """Return the docstring of a module as a part of a page, with links to the other pages."""
+    return re.sub(r"`docs/(\w+)\.md`", r"[\1](\1.md)", inspect.getdoc(module) or "")
+
+
+def selection_page(_: str) -> str:
+    """Return docs/environment_selection.md: the docstring of the environment with selection."""
+    text = text_of(env_selection)
+    text = re.sub(r":mod:`marl_pack.env_aec`", "the [environment](environment.md)", text)
+    return f"""# The environment with a buffer, a preview or several bins
+
+<!-- Written by `make pages` from the docstring of marl_pack/env_selection.py: change it there. -->
+
+{text}
+"""
+
+
 def environment_page(_: str) -> str:
     """Return docs/environment.md: the docstring of the environment, and its arguments."""
-    text = re.sub(r"`docs/(\w+)\.md`", r"[\1](\1.md)", inspect.getdoc(env_aec) or "")
+    text = text_of(env_aec)
     before, after = text.split("\n## Seeds and episodes\n")
     return f"""# The environment
 
@@ -122,6 +139,7 @@ def millimetres_page(page: str) -> str:
 
 PAGES = {
     "environment.md": environment_page,
+    "environment_selection.md": selection_page,
     "onnx.md": onnx_page,
     "millimetres.md": millimetres_page,
 }

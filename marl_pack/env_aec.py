@@ -99,6 +99,9 @@ option the message names the nearest valid name.
 `illegal="repair"`) → `AssertOutOfBounds` → `OrderEnforcing`. `raw_env()` takes all arguments except
 `illegal_reward`, and raises `ValueError` on an illegal action.
 
+A game with `buffer`, `preview`, `bins` or `closings` has other agents and observations
+(`docs/environment_selection.md`); `raw_env` does not take these options.
+
 ## Seeds and episodes
 
 `reset(seed=s)` begins the item stream of seed s. `reset()` without a seed begins the next episode
@@ -148,46 +151,40 @@ value beyond a limit is refused before anything has changed.
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, overload
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv
 
 from marl_pack.bins import COUNT, FILLED, HEIGHTMAP
-from marl_pack.checks import truth_value
+from marl_pack.env_cells import RENDER_MODES, CellEnv, fill_planes
 from marl_pack.env_turns import AGENTS as AGENTS
-from marl_pack.env_turns import (
-    ORIENTATION,
-    PLACEMENT,
-    TurnEnv,
-    in_parallel,
-    one_of,
-    wrap,
-)
+from marl_pack.env_turns import ORIENTATION, PLACEMENT, in_parallel, one_of, wrap
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameOptions, GameSpec
+from marl_pack.game.spec import (
+    GameOptions,
+    GameSpec,
+    SelectionOptions,
+    SelectionSpec,
+    added_options,
+)
 from marl_pack.geometry import ORIENTATIONS
-from marl_pack.installation import njit
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.option_record import document, with_options
-from marl_pack.plan import Plan
 
 if TYPE_CHECKING:
     from marl_pack.env_mm import OptionsMm
 
 TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
-RENDER_MODES = ["human", "rgb_array", "ansi"]
 WORLDS = ("cells", "mm")
 
 
-class Options(GameOptions, total=False):
-    """The keyword arguments of :class:`raw_env`; its signature has their defaults."""
+class Arguments(TypedDict, total=False):
+    """The keyword arguments of the environments on cells that are no options of the game."""
 
     bin_size: tuple[int, int, int]
     items: str | Path | ArrayLike | Items | Mapping[str, Any] | Stream
@@ -197,6 +194,10 @@ class Options(GameOptions, total=False):
     pad_actions: bool
     mask_in: str
     illegal: str
+
+
+class Options(Arguments, SelectionOptions, total=False):
+    """The keyword arguments of :func:`env`; its signature has their defaults."""
 
 
 @overload
@@ -215,7 +216,9 @@ def env(*, world: str = "cells", illegal_reward: float = -1.0, **options: Any) -
             it and its other options.
         illegal_reward: reward of the agent that ends the game by an illegal action (only with
             ``illegal="terminate"``).
-        **options: the arguments of :class:`raw_env`: ``bin_size``, ``items``, ``rule``, …
+        **options: the arguments of :class:`raw_env`: ``bin_size``, ``items``, ``rule``, …; and
+            ``buffer``, ``preview``, ``bins`` and ``closings``
+            (:mod:`marl_pack.env_selection`).
     """
     return _make(world, illegal_reward, options)
 
@@ -227,7 +230,13 @@ def _make(world: str, illegal_reward: float, options: Mapping[str, Any]) -> AECE
         from marl_pack import env_mm
 
         return wrap(env_mm.raw_env(**options), illegal_reward)
-    return wrap(raw_env(**options), illegal_reward)
+    added = {name: options[name] for name in added_options() if name in options}
+    if SelectionSpec(**added).selects:
+        from marl_pack import env_selection
+
+        return wrap(env_selection.raw_env(**options), illegal_reward)
+    paper = {name: value for name, value in options.items() if name not in added}
+    return wrap(raw_env(**paper), illegal_reward)
 
 
 @overload
@@ -268,7 +277,7 @@ def parallel_env(
         world: the argument of :func:`env`.
         simultaneous: whether one step is one item (see above).
         illegal_reward: the argument of :func:`env`.
-        **options: the arguments of :class:`raw_env`.
+        **options: the arguments of :func:`env`.
 
     Raises:
         ValueError: if ``simultaneous`` is true without ``illegal="repair"``.
@@ -278,8 +287,8 @@ def parallel_env(
 
 
 @document(GameSpec, " " * 8)
-class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
-    """The environment without wrappers: one bin and two agents.
+class raw_env(CellEnv):  # noqa: N801  # PettingZoo's name for it
+    """The environment without wrappers: one visible item, one bin and two agents.
 
     The module's docstring describes agents, spaces, masks, reward and the end of an episode. Copies
     and pickles continue exactly from the same state, without the original's window.
@@ -330,90 +339,27 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         illegal: str = "terminate",
         **options: Unpack[GameOptions],
     ) -> None:
-        super().__init__(max_cycles, mask_in, illegal)
-        if render_mode is not None:
-            one_of("render_mode", render_mode, RENDER_MODES)
-        self.render_mode = render_mode
-        self.pad_actions = truth_value(pad_actions, "pad_actions")
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
-        self._stream_game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
-        self._game = self._stream_game
         self._all_masked = self._spec.mask_orientations  # an orientation chosen has a legal cell
-        self._unit = max(self._game.size)
-        self._read_game()
-
-        width, depth, _ = self._game.size
-        choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: width * depth}
-        if pad_actions:
-            choices = dict.fromkeys(AGENTS, max(choices.values()))
-        self._choices = choices
-        planes = spaces.Box(0.0, 1.0, (5 if pad_actions else 4, width, depth), np.float32)
-        self.action_spaces = {agent: spaces.Discrete(n) for agent, n in choices.items()}
-        self.observation_spaces = {
-            agent: planes
-            if mask_in == "info"
-            else spaces.Dict(  # pairs, since Gymnasium sorts the keys of a plain dict
-                [("observation", planes), ("action_mask", spaces.Box(0, 1, (n,), np.int8))]
-            )
-            for agent, n in choices.items()
-        }
-        self.state_space = spaces.Box(0.0, 1.0, (5, width, depth), np.float32)
+        game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)
+        choices = {ORIENTATION: len(ORIENTATIONS), PLACEMENT: game.floor.cells}
+        super().__init__(
+            game, choices, 4, max_cycles=max_cycles, render_mode=render_mode,
+            pad_actions=pad_actions, mask_in=mask_in, illegal=illegal,
+        )  # fmt: skip
         self._orientation_played = np.zeros(1, np.int64)
         self._cell_played = np.zeros(1, np.int64)
-        self._window: Any = None  # opened by the first picture
 
     @property
     def game(self) -> Packing:
         """The game behind this view, for policies; only ``reset`` and ``step`` may change it."""
-        return self._game
-
-    @property
-    def chosen(self) -> int | None:
-        """The orientation that was chosen for the item; None in the orientation agent's turn."""
-        return self._chosen
-
-    @property
-    def plan(self) -> Plan:
-        """The boxes placed so far in this episode, in their order."""
-        return self._game.plans()[0]
+        game: Packing = self._game
+        return game
 
     # --- the game ---------------------------------------------------------------------------------
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Empty the bin and begin an episode.
-
-        Args:
-            seed: seed from which the item stream begins again. Without a seed the stream continues
-                with its next episode (from a random seed if there never was one).
-            options: ``{"items": …}`` plays these items once instead of the stream's: an array
-                [L, 3], or items with attributes.
-
-        Raises:
-            ValueError: for an impossible seed or impossible items, or if no episode has a legal
-                first item; then nothing has changed.
-        """
-        seed, episode = self._next_episode(seed, options)
-        if options and options.get("items") is not None:
-            try:
-                game = Packing(1, items=options["items"], spec=self._spec, auto_reset=False)
-            except ValueError as error:
-                raise ValueError(f'options["items"]: {error}') from None
-            if not bool(game.alive):
-                raise ValueError(
-                    f'options["items"]: the first item {game.items.sides[0].tolist()} may be '
-                    "placed nowhere in the empty bin: check orientations, the rule's margin and "
-                    "com_offset"
-                )
-        else:
-            game = self._stream_game
-            # An episode may have no legal first item: skip it.
-            game.reset(seed, first_episode=episode + 1, skip=True)
-            episode = int(game.episode)
-        self._seed, self._episode, self._game = seed, episode, game
-
-        self._begin()
-        self._read_game()
-        self.infos = {agent: self._info(agent) for agent in AGENTS}
+    def _new_game(self, items: Any) -> Packing:
+        return Packing(1, items=items, spec=self._spec, auto_reset=False)
 
     def _choose(self, orientation: int) -> None:
         if self._orientation_mask[orientation] and (
@@ -434,11 +380,7 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         self._placed(float(outcome.reward), bool(outcome.done))
 
     def _nearest(self, action: int, legal: NDArray[np.intp]) -> int:
-        return self._game.floor.nearest(action, legal)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy or a pickle: everything except the window."""
-        return vars(self) | {"_window": None}
+        return self.game.floor.nearest(action, legal)
 
     # --- observations -----------------------------------------------------------------------------
 
@@ -456,57 +398,17 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         """The legal actions of the acting agent, bool [6] or [W · D]."""
         return self._orientation_mask if self._chosen is None else self._masks[self._chosen]
 
-    def _sides(self, oriented: bool) -> NDArray[np.int16]:
-        """Return the item's sides as it comes, or along x, y, z in the chosen orientation."""
-        if oriented and self._chosen is not None:
-            return self._item[list(ORIENTATIONS[self._chosen])]
-        return self._item
-
-    def _planes(self, oriented: bool, whose_turn: bool) -> NDArray[np.float32]:
+    def _planes(self, agent: str | None) -> NDArray[np.float32]:
         heightmap = self._game.bins.arrays[HEIGHTMAP][0]
+        whose_turn = agent is None or self.pad_actions
         planes = np.empty((4 + whose_turn, *heightmap.shape), np.float32)
-        orientation = ORIENTATIONS[self._chosen if oriented and self._chosen is not None else 0]
-        turn = self._chosen is not None
-        _fill_planes(heightmap, self._item, orientation, self._unit, turn, planes)
+        chosen = 0 if agent == ORIENTATION else self._chosen or 0
+        fill_planes(heightmap, self._item, ORIENTATIONS[chosen], self._unit, planes)
+        if whose_turn:
+            planes[4] = self._chosen is not None
         return planes
 
-    def observe(self, agent: str) -> Any:
-        """Return the agent's observation; this works in both agents' turns and after the end."""
-        planes = self._planes(agent == PLACEMENT, self.pad_actions)
-        if self.mask_in == "info":
-            return planes
-        return {"observation": planes, "action_mask": self.action_mask(agent)}
-
-    def state(self) -> NDArray[np.float32]:
-        """Return float32 [5, W, D]: heightmap, the item as it lies, and whose turn it is (0, 1)."""
-        return self._planes(oriented=True, whose_turn=True)
-
     # --- rendering --------------------------------------------------------------------------------
-
-    def render(self) -> NDArray[np.uint8] | str | None:
-        """Show the bin, the visible item and the cells where it may be placed.
-
-        Returns:
-            uint8 [rows, columns, 3] for ``"rgb_array"``, text for ``"ansi"``, None for ``"human"``
-            (a window shows the picture).
-        """
-        if self.render_mode is None:
-            warnings.warn(
-                f"render() without a render_mode: make the environment with one of {RENDER_MODES}",
-                stacklevel=2,
-            )
-            return None
-        if self.render_mode == "ansi":
-            return self._text()
-        image = self._picture()
-        if self.render_mode == "rgb_array":
-            return image
-        if self._window is None:
-            from marl_pack.render.window import Window
-
-            self._window = Window()
-        self._window.show(image)
-        return None
 
     def _title(self) -> str:
         return f"{self._packed} boxes, utilization {self.utilization:.1%}"
@@ -514,7 +416,8 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
     def _text(self) -> str:
         from marl_pack.render.turn import turn_text
 
-        game, sides = self._game, self._sides(oriented=True).tolist()
+        game = self._game
+        sides = self._item[list(ORIENTATIONS[self._chosen or 0])].tolist()
         return turn_text(self._title(), sides, game.bins.heightmap.numpy()[0], game.size[2])
 
     def _picture(self) -> NDArray[np.uint8]:
@@ -526,33 +429,15 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
             self._title(), self._game.size, boxes, self._item.tolist(), masks, self._chosen
         )
 
-    def close(self) -> None:
-        """Close the window, if one was opened."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
-
-
-@njit(cache=True)
-def _fill_planes(
-    heightmap: Any, item: Any, orientation: tuple[int, int, int], unit: int, turn: bool, planes: Any
-) -> None:
-    """Write the planes float32 [4 or 5, W, D] of an observation: heightmap, sides and turn."""
-    longest = np.float32(unit)
-    for x in range(heightmap.shape[0]):
-        for y in range(heightmap.shape[1]):
-            planes[0, x, y] = np.float32(heightmap[x, y]) / longest
-    for axis in range(3):
-        planes[1 + axis] = np.float32(item[orientation[axis]]) / longest
-    if planes.shape[0] > 4:
-        planes[4] = turn
-
 
 def _name_options(function: Any) -> None:
-    """Add every option that a function passes on to :class:`raw_env` to its signature."""
+    """Add every option that a function passes on to an environment to its signature."""
+    parameters = inspect.signature(raw_env).parameters
+    left_out = [*TAKEN, *(name for name in parameters if name not in TAKEN)]
+    more = with_options(SelectionSpec, inspect.Signature(), left_out).parameters
     named = [
         parameter.replace(kind=parameter.KEYWORD_ONLY)
-        for parameter in inspect.signature(raw_env).parameters.values()
+        for parameter in (*parameters.values(), *more.values())
     ]
     signature = inspect.signature(function)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]

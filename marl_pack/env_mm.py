@@ -144,7 +144,7 @@ class raw_env(TurnEnv):  # noqa: N801  # PettingZoo's name for it
         illegal: str = "terminate",
         **options: Any,
     ) -> None:
-        super().__init__(max_cycles, mask_in, illegal)
+        super().__init__(AGENTS, max_cycles, mask_in, illegal)
         if render_mode is not None:
             one_of("render_mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode

@@ -1,7 +1,8 @@
-"""What the two-agent environments share: turns, action masks, and PettingZoo's wrappers.
+"""What the environments share: turns, action masks, and PettingZoo's wrappers.
 
-:mod:`marl_pack.env_aec` is the environment on whole cells, :mod:`marl_pack.env_mm` the one in
-millimetres. Both derive from :class:`TurnEnv`.
+:mod:`marl_pack.env_aec` is the environment on whole cells, :mod:`marl_pack.env_selection` the one
+with a buffer, a preview or several bins, :mod:`marl_pack.env_mm` the one in millimetres. All derive
+from :class:`TurnEnv`.
 """
 
 from __future__ import annotations
@@ -24,17 +25,19 @@ from pettingzoo.utils.conversions import (
 from marl_pack.checks import LARGEST_SEED, real_number, shown, truth_value, whole_number
 from marl_pack.game.state import Copied
 
-ORIENTATION, PLACEMENT = "orientation_0", "placement_0"
+SELECTION, ORIENTATION, PLACEMENT = "selection_0", "orientation_0", "placement_0"
 AGENTS = [ORIENTATION, PLACEMENT]
+"""The agents of the paper's game, in the order of their turns."""
 
 
 class TurnEnv(Copied, AECEnv):
-    """A view of one packing game with two agents that take turns.
+    """A view of one packing game with agents that take turns.
 
     An environment sets the spaces and the game, and defines :attr:`legal_actions`, ``_choose``,
     ``_place`` and ``observe``.
 
     Args:
+        agents: names of the agents, in the order of their turns.
         max_cycles: items after which an episode is truncated; None for no limit.
         mask_in: ``"observation"`` or ``"info"``, where the action masks are.
         illegal: ``"terminate"`` or ``"repair"``, what happens on an illegal action.
@@ -47,14 +50,16 @@ class TurnEnv(Copied, AECEnv):
     action_spaces: dict[str, spaces.Space[Any]]
     observation_spaces: dict[str, spaces.Space[Any]]
 
-    def __init__(self, max_cycles: int | None, mask_in: str, illegal: str) -> None:
+    def __init__(
+        self, agents: Sequence[str], max_cycles: int | None, mask_in: str, illegal: str
+    ) -> None:
         super().__init__()
         one_of("mask_in", mask_in, ("observation", "info"))
         one_of("illegal", illegal, ("terminate", "repair"))
         if max_cycles is not None:
             max_cycles = whole_number(max_cycles, "max_cycles (None for no limit)", 1)
         self.max_cycles, self.mask_in, self.illegal = max_cycles, mask_in, illegal
-        self.possible_agents = list(AGENTS)
+        self.possible_agents = list(agents)
         self.agents: list[str] = []
         self._chosen: int | None = None
         self._packed = 0
@@ -99,13 +104,14 @@ class TurnEnv(Copied, AECEnv):
         return seed, episode
 
     def _begin(self) -> None:
-        """Begin an episode: both agents play, and nothing has been placed."""
-        self.agents = list(AGENTS)
-        self.agent_selection = ORIENTATION
-        self.rewards = dict.fromkeys(AGENTS, 0.0)
-        self._cumulative_rewards = dict.fromkeys(AGENTS, 0.0)
-        self.terminations = dict.fromkeys(AGENTS, False)
-        self.truncations = dict.fromkeys(AGENTS, False)
+        """Begin an episode: all agents play, and nothing has been placed."""
+        agents = self.possible_agents
+        self.agents = list(agents)
+        self.agent_selection = agents[0]
+        self.rewards = dict.fromkeys(agents, 0.0)
+        self._cumulative_rewards = dict.fromkeys(agents, 0.0)
+        self.terminations = dict.fromkeys(agents, False)
+        self.truncations = dict.fromkeys(agents, False)
         self._cycle = 0
         self._chosen = None
 
@@ -124,16 +130,20 @@ class TurnEnv(Copied, AECEnv):
         choice, repaired = self._legal(agent, action)
         self._cumulative_rewards[agent] = 0.0
         self._clear_rewards()
-        if self._chosen is not None:
-            self._place(self._chosen, choice)
-        else:
-            self._choose(choice)
+        self._play(choice)
         self.agent_selection = self._acting
         self.infos = {name: self._info(name) for name in self.agents}
         if repaired:
             self.infos[agent]["repaired"] = True
         if self.render_mode == "human":
             self.render()
+
+    def _play(self, choice: int) -> None:
+        """Play a legal action of the acting agent."""
+        if self._chosen is not None:
+            self._place(self._chosen, choice)
+        else:
+            self._choose(choice)
 
     def _choose(self, orientation: int) -> None:
         """Play a legal action of the orientation agent."""
@@ -144,7 +154,7 @@ class TurnEnv(Copied, AECEnv):
         raise NotImplementedError
 
     def _placed(self, reward: float, ended: bool) -> None:
-        """End a cycle: give both agents the reward; end or truncate the episode."""
+        """End a cycle: give all agents the reward; end or truncate the episode."""
         self._cycle += 1
         self._chosen = None
         out_of_time = self.max_cycles is not None and self._cycle >= self.max_cycles

@@ -22,9 +22,9 @@ from pettingzoo.test import (
 from pettingzoo.test.state_test import state_test
 from pettingzoo.utils import wrappers
 
-from marl_pack import env_aec, env_turns
+from marl_pack import env_aec, env_selection, env_turns
 from marl_pack.game.packing import Packing
-from marl_pack.game.spec import GameSpec
+from marl_pack.game.spec import GameSpec, SelectionSpec
 from marl_pack.geometry import ORIENTATIONS
 
 O, P = "orientation_0", "placement_0"  # noqa: E741  # the two agents
@@ -40,14 +40,24 @@ VARIANTS: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.parametrize("make", [env_aec.env, env_aec.parallel_env, env_aec.raw_env])
-def test_the_signature_names_every_option_with_its_default(make: Any) -> None:
+@pytest.mark.parametrize(
+    ("make", "spec"),
+    [
+        (env_aec.env, SelectionSpec),
+        (env_aec.parallel_env, SelectionSpec),
+        (env_aec.raw_env, GameSpec),
+        (env_selection.raw_env, SelectionSpec),
+    ],
+)
+def test_the_signature_names_every_option_with_its_default(make: Any, spec: Any) -> None:
     parameters = inspect.signature(make).parameters
-    for option in fields(GameSpec):
+    for option in fields(spec):
         assert parameters[env_aec.TAKEN.get(option.name, option.name)].default == option.default
     # What type checkers and editors read names the same arguments.
     typed = env_aec.Options.__optional_keys__
-    assert typed == set(inspect.signature(env_aec.raw_env).parameters) <= set(parameters)
+    raw = env_aec.raw_env if spec is GameSpec else env_selection.raw_env
+    assert set(inspect.signature(raw).parameters) <= typed & set(parameters)
+    assert typed == set(inspect.signature(env_selection.raw_env).parameters)
 
 
 def mask_of(env: Any, agent: str) -> np.ndarray:

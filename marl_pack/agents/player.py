@@ -10,14 +10,15 @@ import torch
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
+from marl_pack import env_aec, env_selection
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.policy import InTurns, Placement, Policy
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.policies import SelectFirst
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.bins import check_device
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
-from marl_pack.env_aec import AGENTS, raw_env
 from marl_pack.env_turns import AtOnce
 from marl_pack.game.packing import Packing
 
@@ -94,7 +95,9 @@ class Player:
 
     def __init__(self, policy: Policy, search: BeamSettings | None = None) -> None:
         self.policy, self.search = policy, search
-        self._agents = policy if isinstance(policy, InTurns) else _TwoTurns(policy)
+        agents = policy.policy if isinstance(policy, SelectFirst) else policy
+        self._agents = agents if isinstance(agents, InTurns) else _TwoTurns(agents)
+        self._chosen: tuple[object, list[int]] = (None, [])  # a turn, and the choices in it
 
     @overload
     def __call__(self, game: Packing) -> Placement: ...
@@ -126,7 +129,8 @@ class Player:
         The placement agent uses the chosen orientation, even if another player chose it.
 
         Args:
-            env: an environment of :mod:`marl_pack.env_aec`, with or without wrappers.
+            env: an environment of :mod:`marl_pack.env_aec` or :mod:`marl_pack.env_selection`, with
+                or without wrappers.
 
         Returns:
             The action, or None for an agent whose episode has ended. For a parallel environment, a
@@ -136,19 +140,44 @@ class Player:
             ValueError: if this is another environment, or if no agent is left to act.
         """
         raw = getattr(env, "unwrapped", None)
-        if not isinstance(raw, raw_env):
+        if not isinstance(raw, env_aec.raw_env | env_selection.raw_env):
             raise ValueError(f"act: needs an environment of marl_pack.env_aec, not {shown(env)}")
         _, _, terminated, truncated, _ = raw.last(observe=False)
         if isinstance(env, AtOnce):
-            return {name: int(choice) for name, choice in zip(AGENTS, self(raw.game), strict=True)}
+            choices = self(raw.game)[-len(raw.possible_agents) :]
+            return {a: int(c) for a, c in zip(raw.possible_agents, choices, strict=True)}
         action = None if terminated or truncated else self._turn(raw)
         return {raw.agent_selection: action} if isinstance(env, ParallelEnv) else action
 
-    def _turn(self, env: raw_env) -> int:
+    def _turn(self, env: env_aec.raw_env | env_selection.raw_env) -> int:
         """Return the choice of the agent whose turn it is."""
+        if isinstance(env, env_selection.raw_env):
+            return self._selecting_turn(env)
         if env.chosen is None:
             return int(self._agents.orientation_agent(env.game))
         return int(self._agents.placement_agent(env.game, torch.tensor([env.chosen])))
+
+    def _selecting_turn(self, env: env_selection.raw_env) -> int:
+        """Return the choice of the agent whose turn it is, in an environment with selection.
+
+        An agent follows the policy's choice in this turn, as long as the agents before it have
+        chosen the same. Otherwise a policy in turns sees what they chose.
+        """
+        game = env.game
+        if env.agent_selection == env.possible_agents[0]:
+            self._chosen = game.turn, [int(choice) for choice in self._selecting(game)]
+        turn, choices = self._chosen
+        before = [number for number in (env.selected, env.chosen) if number is not None]
+        if turn is game.turn and choices[: len(before)] == before:
+            return choices[len(before)]
+        return self._other_choice(env)
+
+    def _other_choice(self, env: env_selection.raw_env) -> int:
+        """Return a choice for a box, a bin or an orientation that another player has chosen."""
+        view, agents = env.view(), self._agents
+        if env.chosen is None:
+            return int(agents.orientation_agent(view))
+        return int(agents.placement_agent(view, torch.tensor([env.chosen])))
 
 
 class _TwoTurns:

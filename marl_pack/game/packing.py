@@ -11,7 +11,6 @@ has no more items, or when the bin contains the largest number of items allowed.
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +27,12 @@ from marl_pack.bins import COUNT, UNKNOWN, Bins, check_device
 from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game import compiled, invariants
 from marl_pack.game.moves import Floor, LegalMoves, Moves
+from marl_pack.game.origins import origin, without_origin
 from marl_pack.game.spec import GameOptions, GameSpec, SelectionSpec
 from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.game.turns import Oriented, Outcome
 from marl_pack.geometry import ALL_ORIENTATIONS, orientation_table
-from marl_pack.items import DEFAULT_SIDES, Items, Stream, fingerprint, make_stream
+from marl_pack.items import DEFAULT_SIDES, Items, Stream, make_stream
 from marl_pack.option_record import document
 from marl_pack.plan import Plan
 from marl_pack.stability import OrientedItem
@@ -69,6 +69,7 @@ class Packing(Copied):
         turn: an object that identifies this turn of these games; every turn has a new one.
         checked: whether every placement is checked with simple code, which is slow
             (:mod:`marl_pack.game.invariants`).
+        following: int16 [G, 3], the sides of the first item of a preview; None without one.
         orientation_sets: the sets of orientations that items may take in this game, each with the
             share of the items that have exactly this set.
         n, size, volume, floor: G, (W, D, H), W · D · H, and the numbers of cells and pairs.
@@ -137,6 +138,7 @@ class Packing(Copied):
         empty = bin_state.empty(n, self.size, 0, self.device, self.backend)
         self._empty = replace(empty, untouched=True)
         self._all_fit = self.backend is Backend.TENSOR and self._every_item_fits()
+        self.following: Tensor | None = None
         self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.reset(first_episode=first_episode)
 
@@ -240,16 +242,7 @@ class Packing(Copied):
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of all tensors that the rest of the games depends on."""
         tensors = {name: tensor.clone() for name, tensor in self.state.tensors().items()}
-        return tensors | self._origin()
-
-    def _origin(self) -> dict[str, Tensor]:
-        """Return numbers that identify the items, the options and the seed of these games."""
-        options = hashlib.blake2b(repr(self.spec.to_dict()).encode(), digest_size=7).digest()
-        return {
-            "items_fingerprint": torch.tensor(fingerprint(self.stream)),
-            "options_fingerprint": torch.tensor(int.from_bytes(options, "little")),
-            "seed": torch.tensor(self.seed % 2**63),
-        }
+        return tensors | origin(self.stream, self.spec, self.seed)
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore a :meth:`state_dict` of games made with the same arguments.
@@ -260,14 +253,7 @@ class Packing(Copied):
             ValueError: if it belongs to other games, or these games cannot reach it. The games have
                 not changed then.
         """
-        tensors = dict(tensors)
-        for name, expected in self._origin().items():
-            number = tensors.pop(name, expected)  # the games are played again in any case
-            same = isinstance(number, Tensor) and number.dtype == expected.dtype
-            if not same or not torch.equal(number.cpu(), expected):
-                part = name.removesuffix("_fingerprint")
-                changed = "; was their file changed?" if part == "items" else ""
-                raise ValueError(f"state of another game: needs the {part} of this game{changed}")
+        tensors = without_origin(tensors, origin(self.stream, self.spec, self.seed))
         state = self.state.holding(tensors)
         self._check_origin(state)
         self.state.copy_from(state)

@@ -13,7 +13,7 @@ this is the game of :class:`marl_pack.game.packing.Packing`, action by action.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,84 +24,25 @@ from torch import Tensor
 from marl_pack import bins as bin_state
 from marl_pack.backend import Backend
 from marl_pack.bins import Bins
-from marl_pack.checks import described, shown, truth_value, whole_number
+from marl_pack.checks import LARGEST_SEED, described, shown, truth_value, whole_number
 from marl_pack.game.moves import Moves
+from marl_pack.game.origins import origin, without_origin
 from marl_pack.game.packing import LAST_EPISODE, MOST_SKIPPED, Packing
+from marl_pack.game.selection_state import (
+    EVERYTHING,
+    NOTHING,
+    NothingMore,
+    SelectionOutcome,
+    SelectionState,
+)
 from marl_pack.game.spec import SelectionSpec
-from marl_pack.game.state import Copied, GameState
+from marl_pack.game.state import Copied, GameState, refuse_where
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.items import DEFAULT_SIDES, Items, Stream
 from marl_pack.plan import Plan
 
-NOTHING = -1
-"""Position of a slot that holds no box."""
-EVERYTHING = 2**62
-"""Larger than the position of any box."""
-
-
-@dataclass
-class SelectionState:
-    """The state of G games with k slots and b bins; selecting derives from the fields."""
-
-    bins: Bins  # [G · b], bin j of game g has the number g · b + j
-    slots: Tensor  # int64 [G, k]   position in the sequence of each visible box, or NOTHING
-    t: Tensor  # int64 [G]          position of the conveyor's next box
-    known: Tensor  # int64 [G]      boxes from this position on are unknown; only a search sets it
-    episode: Tensor  # int64 [G]    number of the episode
-    stream: Tensor  # [G, …]        state of the item stream in each episode
-    closed: Tensor  # int64 [G]     bins closed so far
-    opened: Tensor  # int64 [G]     bins opened so far
-    packed: Tensor  # int64 [G]     cells filled in all bins, closed ones included
-    placed: Tensor  # int64 [G]     boxes in all bins, closed ones included
-    ended: Tensor  # bool [G]       whether the episode has ended
-    mask: Tensor  # bool [G, k · b, 6, W, D]  legal placements of each option
-
-    def select(self, games: Tensor) -> SelectionState:
-        """Return copies of games, int64 [K]."""
-        b = len(self.bins) // len(self.t)
-        rows = (games[:, None] * b + torch.arange(b, device=games.device)).flatten()
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return SelectionState(**{
-            name: value[rows if name == "bins" else games] for name, value in values.items()
-        })  # fmt: skip
-
-
-@dataclass(frozen=True)
-class SelectionOutcome:
-    """The result of placing a box in each game; before any reset."""
-
-    reward: Tensor  # float32 [G]   Eq. 5, relative to the volume of one bin
-    done: Tensor  # bool [G]        whether the episode ended with this placement
-    packed: Tensor  # int64 [G]     cells filled in all bins of the episode
-    placed: Tensor  # int64 [G]     boxes in all bins of the episode
-    opened: Tensor  # int64 [G]     bins opened in the episode
-    volume: int  # volume of a bin, in cells
-
-    @property
-    def utilization(self) -> Tensor:
-        """Share of the volume of all opened bins that is filled, float64 [G]."""
-        return self.packed.double() / (self.opened * self.volume)
-
-
-class NothingMore:
-    """A stream that describes the boxes of another stream, and brings none.
-
-    Args:
-        stream: the other stream.
-    """
-
-    def __init__(self, stream: Stream) -> None:
-        self.stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "stream":  # a copy that is still empty
-            raise AttributeError(name)
-        return getattr(self.stream, name)
-
-    def item(self, state: Tensor, t: Tensor) -> Items:
-        """Return no items: zero sides [N]."""
-        items = self.stream.item(state, t)
-        return replace(items, sides=torch.zeros_like(items.sides))
+FIRST_CHOICES = 64
+"""Choices of an episode for which there is memory at first."""
 
 
 class SelectionPacking(Copied):
@@ -160,8 +101,9 @@ class SelectionPacking(Copied):
         self.floor, self.device, self.backend = base.floor, base.device, base.backend
         self.seed = base.seed
         self._nothing_more: Any = NothingMore(self.stream)
+        self._all_options: tuple[object, Packing] | None = None
         self._number()
-        self.reset(first_episode)
+        self.reset(first_episode=first_episode)
 
     def _number(self) -> None:
         """Number the options: the game, the slot and the bin of each row of views."""
@@ -172,12 +114,34 @@ class SelectionPacking(Copied):
         self._slot_of = (option // self.b).repeat(self.n)
         self.bin_of = self._game_of * self.b + (option % self.b).repeat(self.n)
 
-    def reset(self, first_episode: int = 0) -> None:
-        """Begin the episodes ``first_episode + g`` with empty bins."""
-        first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
+    def reset(
+        self, seed: int | None = None, first_episode: int = 0, *, skip: bool | None = None
+    ) -> None:
+        """Begin the episodes ``first_episode + g`` with empty bins.
+
+        Args:
+            seed, first_episode, skip: as for :meth:`marl_pack.game.packing.Packing.reset`.
+
+        Raises:
+            ValueError: for an impossible seed or episode, or if all episodes are skipped. The games
+                have not changed then.
+        """
+        attributes = dict(vars(self))
+        try:
+            if seed is not None:
+                self.seed = whole_number(seed, "seed", 0, LARGEST_SEED)
+            first = whole_number(first_episode, "first_episode", 0, LAST_EPISODE - self.n)
+            self._start(self._games + first)
+            if self.auto_reset if skip is None else skip:
+                self._restart(~self.alive)
+        except ValueError:
+            vars(self).update(attributes)
+            raise
+
+    def _start(self, episode: Tensor) -> None:
+        """Begin episodes, int64 [G], in new bins."""
         most = self._base.most_items(self.stream.smallest, self.stream.longest)
         bins = bin_state.empty(self.n * self.b, self.size, most, self.device, self.backend)
-        episode = self._games + first
         zeros = torch.zeros_like(episode)
         shape = self.n, self.options, len(ORIENTATIONS), *self.size[:2]
         self.state = SelectionState(
@@ -187,10 +151,14 @@ class SelectionPacking(Copied):
             torch.zeros(shape, dtype=torch.bool, device=self.device),
         )  # fmt: skip
         self.closed_plans: list[list[Plan]] = [[] for _ in range(self.n)]
+        self.history = self._no_choices(FIRST_CHOICES) if self.auto_reset else None
         self._find(torch.arange(len(self._game_of), device=self.device))
         self._close_where_stuck()
-        if self.auto_reset:
-            self._restart(~self.alive)
+
+    def _no_choices(self, most: int) -> Tensor:
+        """Return memory for the choices of an episode, int32 [G, most, 3]; -1 for no choice."""
+        shape = self.n, most, 3
+        return torch.full(shape, -1, dtype=torch.int32, device=self.device)
 
     # --- what there is ----------------------------------------------------------------------------
 
@@ -245,7 +213,11 @@ class SelectionPacking(Copied):
         Args:
             rows: int64 [R], numbers ``game · (k · b) + option``; by default all, in order.
         """
-        rows = torch.arange(len(self._game_of), device=self.device) if rows is None else rows
+        if rows is None:  # the policies of one turn share this view, and what they compute of it
+            if self._all_options is None or self._all_options[0] is not self.turn:
+                all_rows = torch.arange(len(self._game_of), device=self.device)
+                self._all_options = self.turn, self.view(all_rows)
+            return self._all_options[1]
         base, state, game = self._base, self.state, self._game_of[rows]
         view = base.alias()
         view.stream = self._nothing_more
@@ -260,6 +232,8 @@ class SelectionPacking(Copied):
         view.moves = Moves(state.mask.flatten(0, 1)[rows])
         view.orientation_mask, alive = base.legal.choices(view.moves, view.state.items)
         view.alive = alive & ~state.ended[game]
+        if self.preview:
+            view.following = self._items_at(game, state.t[game]).sides
         view.turn = object()
         return view
 
@@ -268,7 +242,13 @@ class SelectionPacking(Copied):
         return self._games * self.options + selection
 
     def plans(self) -> list[Plan]:
-        """Return the boxes in all opened bins as a plan, one for each game."""
+        """Return the boxes in all opened bins as a plan, one for each game.
+
+        Raises:
+            ValueError: if the games restart by themselves: then closed bins are not kept.
+        """
+        if self.auto_reset:
+            raise ValueError("plans: games with auto_reset do not keep their closed bins")
         bins, names = self.state.bins.to("cpu"), self.stream.id_names
         return [
             joined_plan([*closed, *self._open_plans(bins, g, names)])
@@ -313,6 +293,7 @@ class SelectionPacking(Copied):
         base = self._base
         reward = (base._gain * volume.double() - base._loss * waste.double()).float()
         state.packed = state.packed + volume
+        self._record(torch.stack((selection, orientation, cell), 1))
         state.placed = state.placed + alive.long()
         following = torch.where(state.t < state.known, state.t, NOTHING)[:, None]
         slots = state.slots.scatter(1, slot, following)
@@ -322,11 +303,12 @@ class SelectionPacking(Copied):
             self.bin_of == bins[self._game_of]
         )
         self._find((same & alive[self._game_of]).nonzero().squeeze(1))
-        self._close_where_stuck()
+        emptied = self._close_where_stuck()
         done = alive & ~self.alive
         outcome = SelectionOutcome(
-            reward, done, state.packed, state.placed, self.opened, self.volume
-        )
+            reward, done, state.packed, state.placed, self.opened, emptied | done[:, None],
+            self.volume,
+        )  # fmt: skip
         if self.auto_reset:
             self._restart(done)
         return outcome
@@ -387,14 +369,30 @@ class SelectionPacking(Copied):
         ]
         self.alive = self.selection_mask.any(1)
 
-    def _close_where_stuck(self) -> None:
-        """Close the fullest bin of the games in which no box has a place, until one has."""
+    def _record(self, choices: Tensor) -> None:
+        """Record the choices int64 [G, 3] of the games that play, if they restart by themselves."""
+        if self.history is None:
+            return
+        most, count = self.history.shape[1], self.state.placed
+        if int(count.max()) >= most:
+            self.history = torch.cat((self.history, self._no_choices(most)), 1)
+        self.history[self._games, count] = torch.where(
+            self.alive[:, None], choices.int(), self.history[self._games, count]
+        )
+
+    def _close_where_stuck(self) -> Tensor:
+        """Close the fullest bin of the games in which no box has a place, until one has.
+
+        Returns:
+            Which bins were closed and replaced, bool [G, b].
+        """
+        emptied = torch.zeros(self.n * self.b, dtype=torch.bool, device=self.device)
         while bool((stuck := ~self.alive & ~self.state.ended).any()):
             state = self.state
             if self.searching:
                 state.ended = state.ended | stuck
                 self._find(self._games[:0])
-                return
+                break
             hopeless = stuck & ~self._any_fits(stuck)
             closing = stuck & ~hopeless
             state.closed = state.closed + closing.long()
@@ -405,15 +403,20 @@ class SelectionPacking(Copied):
             fullest = state.bins.filled.view(self.n, self.b).argmax(1)
             again = replaced.nonzero().squeeze(1)
             closed = again * self.b + fullest[again]
-            names = self.stream.id_names
-            for g, row in zip(again.tolist(), closed.tolist(), strict=True):
-                self.closed_plans[g].append(
-                    Plan.from_bins(state.bins.to("cpu"), row, id_names=names)
-                )
+            if not self.auto_reset:
+                self._keep_plans(again, closed)
+            emptied[closed] = True
             which = torch.zeros(self.n * self.b, dtype=torch.bool, device=self.device)
             which[closed] = True
             bin_state.clear(state.bins, which)
             self._find(which[self.bin_of].nonzero().squeeze(1))
+        return emptied.view(self.n, self.b)
+
+    def _keep_plans(self, games: Tensor, closed: Tensor) -> None:
+        """Keep the plan of a bin of each of these games before it is cleared, int64 [K] each."""
+        bins, names = self.state.bins.to("cpu"), self.stream.id_names
+        for g, row in zip(games.tolist(), closed.tolist(), strict=True):
+            self.closed_plans[g].append(Plan.from_bins(bins, row, id_names=names))
 
     def _any_fits(self, games: Tensor) -> Tensor:
         """Return whether a visible box has a place in an empty bin, bool [G]; false elsewhere.
@@ -445,10 +448,70 @@ class SelectionPacking(Copied):
             bin_state.clear(state.bins, ended.repeat_interleave(self.b))
             for g in ended.nonzero().squeeze(1).tolist():
                 self.closed_plans[g] = []
+            if self.history is not None:
+                self.history = self.history.masked_fill(ended[:, None, None], -1)
             self._find(ended[self._game_of].nonzero().squeeze(1))
             self._close_where_stuck()
             ended = ended & ~self.alive
         raise ValueError("no episode can begin: no first box has a legal cell in an empty bin")
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what the rest of the games depends on: their episodes and the choices so far.
+
+        Raises:
+            ValueError: if the games do not record choices, because they have no ``auto_reset``.
+        """
+        if self.history is None:
+            raise ValueError("state_dict: only games with auto_reset record their choices")
+        longest = int(self.state.placed.max())
+        choices = self.history[:, :longest].clone()
+        return {"episode": self.episode.clone(), "choices": choices, "t": self.state.t.clone()} | (
+            origin(self.stream, self.spec, self.seed)
+        )
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore a :meth:`state_dict` of games made with the same arguments.
+
+        The choices in it are played again and checked, so its file need not be trusted.
+
+        Raises:
+            ValueError: if it belongs to other games, or these games cannot reach it. The games have
+                not changed then.
+        """
+        tensors = without_origin(tensors, origin(self.stream, self.spec, self.seed))
+        if set(tensors) != {"episode", "choices", "t"}:
+            raise ValueError("state of another game: needs episode, choices and t")
+        episode, choices, t = tensors["episode"], tensors["choices"], tensors["t"]
+        whole = episode.dtype == t.dtype == torch.int64 and choices.dtype == torch.int32
+        if not whole or choices.dim() != 3 or (episode.shape, t.shape, choices.shape[::2]) != (
+            (self.n,), (self.n,), (self.n, 3)
+        ):  # fmt: skip
+            raise ValueError(f"state of another game: needs the numbers of {self.n} games")
+        refuse_where(episode.abs() > LAST_EPISODE, "episode", "the number of an episode")
+        attributes = dict(vars(self))
+        try:
+            self.auto_reset = False
+            self._start(episode.to(self.device))
+            self.history = self._no_choices(max(FIRST_CHOICES, choices.shape[1] + 1))
+            self._replay(choices.to(self.device).long())
+            refuse_where(self.state.t != t.to(self.device), "t", "the boxes that its choices bring")
+            refuse_where(~self.alive, "episode", "one that has not ended")
+            self.auto_reset = True
+        except ValueError:
+            vars(self).update(attributes)
+            raise
+
+    def _replay(self, choices: Tensor) -> None:
+        """Play recorded choices, int64 [G, T, 3]; -1 after the last one of a game."""
+        for k in range(choices.shape[1]):
+            playing = choices[:, k, 0] >= 0
+            refuse_where(playing & ~self.alive, "choices", "none after the end of an episode")
+            refuse_where(playing & (self.state.placed != k), "choices", "no gaps")
+            self.alive = playing  # the others ignore their choice
+            try:
+                self.place(*choices[:, k].unbind(1))
+            except ValueError as error:
+                raise ValueError(f"state of another game: {error}") from None
 
     def branch(self, games: Tensor, *, only_known: bool = False) -> Self:
         """Return games that begin as copies of some of these and are then played independently.
@@ -468,6 +531,7 @@ class SelectionPacking(Copied):
             branched.state.known = torch.minimum(branched.state.known, limit)
         branched.closed_plans = [list(self.closed_plans[g]) for g in games.tolist()]
         branched.selection_mask, branched.alive = self.selection_mask[games], self.alive[games]
+        branched.history = None
         branched._number()
         branched.turn = object()
         return branched

@@ -254,5 +254,20 @@ class GameOptions(TypedDict, total=False):
     max_items: int | None
 
 
+class SelectionOptions(GameOptions, total=False):
+    """The options of :class:`SelectionSpec` except the bin, as typed keyword arguments."""
+
+    buffer: int
+    preview: int
+    bins: int
+    closings: int | None
+
+
+def added_options() -> tuple[str, ...]:
+    """Return the names of the options that :class:`SelectionSpec` adds to :class:`GameSpec`."""
+    known = {each.name for each in options_of(GameSpec)}
+    return tuple(each.name for each in options_of(SelectionSpec) if each.name not in known)
+
+
 document(GameSpec, " " * 8)(GameSpec)
 document(SelectionSpec, " " * 8)(SelectionSpec)
