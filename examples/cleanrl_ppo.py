@@ -3,6 +3,9 @@
 It needs only marl_pack, which installs PettingZoo and torch:
     pip install -e . && python examples/cleanrl_ppo.py --items 1000000 --minutes 10
 
+With ``--buffer 3`` three boxes are visible. A third agent, ``selection_0``, acts first in each
+cycle and learns which box is next.
+
 With ``--world mm`` both agents learn to pack cartons in millimetres; the placement agent then
 chooses among listed moves, and its network scores each move.
 
@@ -23,7 +26,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical
 
-from marl_pack.env_aec import AGENTS, WORLDS
+from marl_pack.env_aec import WORLDS
+from marl_pack.env_turns import PLACEMENT
 from marl_pack.integrations.network import ActorCritic, MovesActorCritic
 from session import Counted, Session, run
 
@@ -58,8 +62,8 @@ class Turns:
 
 def collect(env: Counted, networks: dict[str, Network], session: Session) -> dict[str, Turns]:
     """Play whole episodes until enough turns have been played."""
-    turns = {agent: Turns() for agent in AGENTS}
-    target = env.items + session.turns // 2
+    turns = {agent: Turns() for agent in networks}
+    target = env.items + session.turns // len(networks)
     while env.items < target:
         env.reset()
         for agent in env.agent_iter():
@@ -115,20 +119,23 @@ def learn(turns: Turns, network: Network, optimizer: torch.optim.Optimizer) -> N
 
 
 def train(session: Session) -> None:
-    """Train both agents until the session ends."""
+    """Train all agents until the session ends."""
     env = session.env()
     env.reset(seed=session.seed)
-    networks = {agent: session.network(agent) for agent in AGENTS}
+    networks = {agent: session.network(agent) for agent in session.agents}
     optimizers = {a: torch.optim.Adam(n.parameters(), RATE) for a, n in networks.items()}
     # The report checks that the weights of these networks change.
     session.watch(*networks.values())
     while session.go_on():
         turns = collect(env, networks, session)
-        for agent in AGENTS:
+        for agent in session.agents:
             learn(turns[agent], networks[agent], optimizers[agent])
-        mean_return = np.sum(turns[AGENTS[1]].rewards) / np.sum(turns[AGENTS[1]].ends)
+        last = turns[PLACEMENT]
+        mean_return = np.sum(last.rewards) / np.sum(last.ends)
         print(f"{session.placed:,} items, return {mean_return:.3f}")
 
 
 if __name__ == "__main__":
-    sys.exit(run("CleanRL's style", "marl_pack", train, description=__doc__, worlds=WORLDS))
+    sys.exit(
+        run("CleanRL's style", "marl_pack", train, description=__doc__, worlds=WORLDS, selects=True)
+    )

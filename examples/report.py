@@ -25,7 +25,7 @@ def draw(reports: Iterable[dict[str, Any]]) -> Table:
     table.add_column("trainer", no_wrap=True)
     for title in (
         "version", "bin", "items", "minutes", "illegal\nactions", "items\nrepeat",
-        "both agents\nupdated", "rewards\ncorrect", "utilization\nbefore", "utilization\nafter",
+        "all agents\nupdated", "rewards\ncorrect", "utilization\nbefore", "utilization\nafter",
     ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
     for report in reports:

@@ -1,7 +1,7 @@
 """The command line of the examples, and the compliance report about a trainer.
 
 A trainer passes if it plays no illegal action, always gets new items, changes the weights that
-choose the actions of both agents, and stores for each agent rewards whose sum is the sum of the
+choose the actions of all agents, and stores for each agent rewards whose sum is the sum of the
 environment's rewards. :class:`Session` checks this without changing the trainer: it wraps the
 environment, copies the weights before training, and plays held-out sequences before and after.
 """
@@ -21,8 +21,8 @@ import torch
 from pettingzoo.utils.wrappers import BaseWrapper
 
 from marl_pack import env_aec, env_turns
-from marl_pack.env_aec import AGENTS
 from marl_pack.env_mm import COLUMNS
+from marl_pack.env_turns import PLACEMENT
 from marl_pack.evaluation.statistics import interval
 from marl_pack.files import write_json
 from marl_pack.integrations.network import ActorCritic, MovesActorCritic
@@ -57,7 +57,7 @@ class Counted(BaseWrapper):
     def __init__(self, env: Any) -> None:
         super().__init__(env)
         self.items, self.illegal, self.seeded = 0, 0, 0
-        self.totals = dict.fromkeys(AGENTS, 0.0)
+        self.totals = dict.fromkeys(env.possible_agents, 0.0)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begin an episode; count it if a seed is given."""
@@ -71,7 +71,7 @@ class Counted(BaseWrapper):
         if played:
             raw = self.env.unwrapped
             self.illegal += not raw.action_mask(agent)[int(action)]
-            self.items += agent == AGENTS[1]
+            self.items += agent == PLACEMENT
         super().step(action)
         if played:
             for name, reward in self.env.rewards.items():
@@ -92,6 +92,7 @@ class Session:
         arguments: arguments of the command line; None: the arguments of this process.
         description: the text of ``--help``.
         worlds: the worlds that the example can play.
+        selects: whether the example can play games with a buffer.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class Session:
         arguments: Sequence[str] | None = None,
         description: str = "",
         worlds: Sequence[str] = ("cells",),
+        selects: bool = False,
     ) -> None:
         parser = argparse.ArgumentParser(description=description)
         add = parser.add_argument
@@ -119,11 +121,19 @@ class Session:
         if len(worlds) > 1:
             add("--world", choices=worlds, default=worlds[0],
                 help="mm: cartons in millimetres instead of whole cells")  # fmt: skip
+        if selects:
+            add("--buffer", type=int, default=1, metavar="K",
+                help="visible boxes, any of which may be placed next (default: 1); with more than "
+                     "one, a third agent selects the box")  # fmt: skip
         options = parser.parse_args(arguments)
         self.in_mm = len(worlds) > 1 and options.world == "mm"
         self.items, self.turns, self.seed = options.items, options.turns, options.seed
         self.episodes = options.episodes
         self.game = {"bin_size": tuple(options.bin), "sides": tuple(options.sides)}
+        if selects and options.buffer > 1:
+            if self.in_mm:
+                parser.error("--buffer: needs --world cells")
+            self.game["buffer"] = options.buffer
         self.bin_size, self.sides = tuple(options.bin), tuple(options.sides)
         if self.in_mm:
             self.game, self.bin_size = MILLIMETRES, MILLIMETRES["bin_mm"]
@@ -132,7 +142,12 @@ class Session:
             parser.error("--episodes: needs at least 2 for an interval")
         self.minutes = options.minutes or float("inf")
         self.envs: list[Counted] = []
-        self.credited = dict.fromkeys(AGENTS, 0.0)
+        example = env_aec.env(**self.game)
+        self.agents: list[str] = example.possible_agents
+        self.credited = dict.fromkeys(self.agents, 0.0)
+        if not self.in_mm:
+            self.planes = example.observation_space(self.agents[0])["observation"].shape[0]
+            self.options = int(example.action_space(self.agents[0]).n)
         torch.set_num_threads(1)
         torch.manual_seed(options.seed)
         np.random.seed(options.seed)  # noqa: NPY002  # some trainers use NumPy's global generator
@@ -164,23 +179,21 @@ class Session:
     def network(self, agent: str) -> ActorCritic | MovesActorCritic:
         """Return a new network for an agent that reads the observations of the game."""
         kind = agent.partition("_")[0]
-        return MovesActorCritic(kind, len(COLUMNS)) if self.in_mm else ActorCritic(kind)
+        if self.in_mm:
+            return MovesActorCritic(kind, len(COLUMNS))
+        return ActorCritic(kind, planes=self.planes, options=self.options)
 
-    def watch(
-        self,
-        orientation: ActorCritic | MovesActorCritic,
-        placement: ActorCritic | MovesActorCritic,
-    ) -> None:
+    def watch(self, *networks: ActorCritic | MovesActorCritic) -> None:
         """Remember the networks that will learn, play with them, and start to time the training.
 
         The report checks later that the weights of these networks have changed.
 
         Args:
-            orientation: network of the orientation agent.
-            placement: network of the placement agent; the same network again if one plays both.
+            *networks: the network of each agent, in the order of their turns; the same network
+                again if one plays several.
         """
-        self.networks = {AGENTS[0]: orientation, AGENTS[1]: placement}
-        self.before = {name: self._head(name) for name in AGENTS}
+        self.networks = dict(zip(self.agents, networks, strict=True))
+        self.before = {name: self._head(name) for name in self.agents}
         self.utilization_before = self.play()
         for env in self.envs:
             env.seeded = 0
@@ -189,7 +202,7 @@ class Session:
     def _head(self, agent: str) -> torch.Tensor:
         """Return a copy of the weights that the agent's policy uses and its critic does not."""
         network = self.networks[agent]
-        head = network.orientations if agent == AGENTS[0] else network.cells
+        head = network.cells if agent == PLACEMENT else network.orientations
         return head.weight.detach().cpu().clone()
 
     def credit(self, agent: str, reward: float) -> None:
@@ -202,7 +215,7 @@ class Session:
 
         Each agent takes its most probable action. The interval is by Student's t.
         """
-        both = self.networks[AGENTS[0]].agent == "both"
+        both = self.networks[PLACEMENT].agent == "both"
         env = env_aec.env(**self.game, **({"pad_actions": True} if both else {}))
         utilizations = []
         for episode in range(self.episodes):
@@ -227,11 +240,11 @@ class Session:
             package: name of the trainer's package; its version is in the report.
         """
         minutes = self.elapsed
-        env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in AGENTS}
-        updated = {a: not torch.equal(self.before[a], self._head(a)) for a in AGENTS}
+        env_rewards = {a: sum(env.totals[a] for env in self.envs) for a in self.agents}
+        updated = {a: not torch.equal(self.before[a], self._head(a)) for a in self.agents}
         rewards_right = {
             a: abs(env_rewards[a] - self.credited[a]) <= 1e-4 * max(1.0, abs(env_rewards[a]))
-            for a in AGENTS
+            for a in self.agents
         }
         return {
             "trainer": trainer,
@@ -266,21 +279,23 @@ def run(
     arguments: Sequence[str] | None = None,
     description: str = "",
     worlds: Sequence[str] = ("cells",),
+    selects: bool = False,
 ) -> int:
     """Run an example and print its compliance report.
 
     Args:
         trainer: name of the trainer in the report.
         package: name of the trainer's package, for its version.
-        train: the function that trains both agents until the session ends.
+        train: the function that trains the agents until the session ends.
         arguments: arguments of the command line; None: the arguments of this process.
         description: the text of ``--help``.
         worlds: the worlds that the example can play.
+        selects: whether the example can play games with a buffer.
 
     Returns:
         The exit status: 0 if it :func:`passes`.
     """
-    session = Session(arguments, description, worlds)
+    session = Session(arguments, description, worlds, selects)
     _running.append(session)
     train(session)
     report = session.report(trainer, package)

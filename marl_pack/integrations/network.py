@@ -13,32 +13,40 @@ from torch import Tensor, nn
 FORBIDDEN = -1e9
 """Logit of an action that is not legal. It is finite, so that no entropy or KL becomes NaN."""
 
-SCORES = {"orientation": (True, False), "placement": (False, True), "both": (True, True)}
-"""For each agent: whether its network scores orientations, and whether it scores cells."""
+SCORES = {
+    "selection": (True, False), "orientation": (True, False), "placement": (False, True),
+    "both": (True, True),
+}  # fmt: skip
+"""For each agent: whether its network scores the whole turn's few choices, and whether cells."""
 
 
 class ActorCritic(nn.Module):
     """A network that computes logits and the state's value from one agent's planes and mask.
 
     Args:
-        agent: ``"orientation"`` scores six orientations, ``"placement"`` scores every cell;
-            ``"both"`` is for ``pad_actions=True``, where one network plays both turns.
+        agent: ``"selection"`` scores pairs of a box and a bin, ``"orientation"`` six orientations,
+            ``"placement"`` every cell; ``"both"`` is for ``pad_actions=True``, where one network
+            plays the turns of the orientation agent and of the placement agent.
         channels: number of feature channels.
+        planes: number of planes in the observation, without the one that says who acts.
+        options: number of pairs that the selection agent scores.
     """
 
-    def __init__(self, agent: str, channels: int = 24) -> None:
+    def __init__(
+        self, agent: str, channels: int = 24, planes: int = 4, options: int = 1
+    ) -> None:  # fmt: skip
         super().__init__()
         if agent not in SCORES:
             raise ValueError(f"agent {agent!r}: one of {', '.join(SCORES)}")
         self.agent = agent
         self.scores_orientations, self.scores_cells = SCORES[agent]
-        planes = 4 + self.scores_cells + (self.scores_cells and self.scores_orientations)
+        planes += self.scores_cells + (self.scores_cells and self.scores_orientations)
         self.trunk = nn.Sequential(
             nn.Conv2d(planes, channels, 3, padding=1), nn.ReLU(),
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(),
         )  # fmt: skip
-        self.orientations = nn.Linear(2 * channels, 6)
+        self.orientations = nn.Linear(2 * channels, options if agent == "selection" else 6)
         self.cells = nn.Conv2d(channels, 1, 1)
         self.critic = nn.Sequential(
             nn.Linear(2 * channels, 64), nn.ReLU(), nn.Linear(64, 1)
