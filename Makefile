@@ -76,6 +76,7 @@ benchmark: $(STAMP)  ## measure every figure on speed in the pages of results
 
 results: $(STAMP)  ## make the pages of results of the figures in results/
 	$(BIN)/python -m experiments.page
+	$(BIN)/python -m experiments.selection_plots
 
 docs: $(STAMP)  ## the pages and the API reference as HTML
 	$(BIN)/sphinx-build -W -q -c docs . build/docs
