@@ -55,9 +55,11 @@ def main() -> int:
         config = from_dict(checkpoint["config"])
 
         def game(n: int, first: int, config: Config = config) -> Packing:
-            return make_game(
+            games = make_game(
                 config, n, chosen.seed, auto_reset=False, device="cpu", first_episode=first
             )
+            assert isinstance(games, Packing), "the published models see one box"
+            return games
 
         agents, values = (
             play(policy, game, chosen.episodes).utilization

@@ -161,7 +161,7 @@ from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv
 
 from marl_pack.bins import COUNT, FILLED, HEIGHTMAP
-from marl_pack.env_cells import RENDER_MODES, CellEnv, fill_planes
+from marl_pack.env_cells import RENDER_MODES, TAKEN, CellEnv, fill_planes
 from marl_pack.env_turns import AGENTS as AGENTS
 from marl_pack.env_turns import ORIENTATION, PLACEMENT, in_parallel, one_of, wrap
 from marl_pack.game.packing import Packing
@@ -179,7 +179,6 @@ from marl_pack.option_record import document, with_options
 if TYPE_CHECKING:
     from marl_pack.env_mm import OptionsMm
 
-TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
 WORLDS = ("cells", "mm")
 
 

@@ -21,6 +21,7 @@ from marl_pack.game.selection import SelectionPacking
 from marl_pack.installation import njit
 from marl_pack.plan import Plan
 
+TAKEN = {"bin": "bin_size"}  # options of the game that have another name here
 RENDER_MODES = ["human", "rgb_array", "ansi"]
 
 

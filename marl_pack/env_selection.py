@@ -72,8 +72,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from marl_pack.env_aec import TAKEN
-from marl_pack.env_cells import RENDER_MODES, CellEnv, fill_planes
+from marl_pack.env_cells import RENDER_MODES, TAKEN, CellEnv, fill_planes
 from marl_pack.env_turns import ORIENTATION, PLACEMENT, SELECTION
 from marl_pack.game.packing import Packing
 from marl_pack.game.selection import SelectionPacking

@@ -11,6 +11,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.game.packing import Packing
+from marl_pack.game.selection import SelectionPacking
+from marl_pack.game.selection_state import SelectionOutcome
 from marl_pack.game.state import Copied
 from marl_pack.game.turns import Outcome
 
@@ -21,7 +23,7 @@ class EndedEpisodes(Mapping[str, Tensor]):
     They are selected when the logger reads them, so that no step waits for their number.
     """
 
-    def __init__(self, outcome: Outcome) -> None:
+    def __init__(self, outcome: Outcome | SelectionOutcome) -> None:
         self._outcome = outcome
 
     @cached_property
@@ -47,9 +49,9 @@ class EndedEpisodes(Mapping[str, Tensor]):
 class PackingVecEnv(Copied, VecEnv):
     """G games with ``auto_reset`` as an environment for rsl_rl's runner; one item in each step.
 
-    A step of the game has two turns. The runner sees the observation of the first turn. The
-    observation of the placement agent depends on the orientation, so the algorithm gets it from
-    the game.
+    A step of the game has two turns, or three where a box and a bin are selected first. The runner
+    sees the observation of the first turn. Those of the later turns depend on earlier choices, so
+    the algorithm gets them from the game.
 
     Args:
         game: the games.
@@ -62,22 +64,25 @@ class PackingVecEnv(Copied, VecEnv):
 
     def __init__(
         self,
-        game: Packing,
-        observe: Callable[[Packing], Mapping[str, Tensor]],
+        game: Packing | SelectionPacking,
+        observe: Callable[[Any], Mapping[str, Tensor]],
         cfg: object = None,
     ) -> None:
         if not game.auto_reset:
             raise ValueError("a game for training needs auto_reset=True")
         self.game, self.observe = game, observe
-        self.num_envs, self.num_actions = game.n, 2
+        selects = isinstance(game, SelectionPacking)
+        self.num_envs, self.num_actions = game.n, 3 if selects else 2
         self.device = game.device
         self.cfg = {} if cfg is None else cfg
-        self.max_episode_length = game.bins.boxes.shape[1]
+        bins = game.b + game.spec.most_closings - 1 if isinstance(game, SelectionPacking) else 1
+        self.max_episode_length = game.bins.boxes.shape[1] * bins
 
     @property
     def episode_length_buf(self) -> Tensor:
         """Number of items placed in each game's episode, int64 [G]."""
-        return self.game.t
+        game = self.game
+        return game.state.placed if isinstance(game, SelectionPacking) else game.t
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
@@ -92,19 +97,23 @@ class PackingVecEnv(Copied, VecEnv):
         """Place the visible item of each game.
 
         Args:
-            actions: int64 [G, 2], orientation and cell, taken from the masks.
+            actions: int64 [G, 2], orientation and cell, or [G, 3], option, orientation and cell,
+                taken from the masks.
 
         Returns:
             The next observation, rewards float32 [G] (Eq. 5), dones uint8 [G] and extras: ``log``
             has the utilization and number of items of the episodes that have ended
-            (:class:`EndedEpisodes`).
+            (:class:`EndedEpisodes`); in games with selection, ``closed`` bool [G, b] says which
+            bins were closed.
 
         Raises:
-            ValueError: unless the actions are int64 [G, 2].
+            ValueError: unless the actions have this shape.
         """
         if actions.shape != (self.num_envs, self.num_actions):
             shape = [self.num_envs, self.num_actions]
             raise ValueError(f"actions {list(actions.shape)}: need int64 {shape}")
-        outcome = self.game.place(actions[:, 0], actions[:, 1], check=False)
-        extras = {"log": EndedEpisodes(outcome)}
+        outcome = self.game.place(*actions.unbind(1), check=False)
+        extras: dict[str, Any] = {"log": EndedEpisodes(outcome)}
+        if isinstance(outcome, SelectionOutcome):
+            extras["closed"] = outcome.emptied
         return self.get_observations(), outcome.reward, outcome.done.byte(), extras

@@ -158,7 +158,7 @@ def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
     policy = make_policy("random", seed=1)
     errors, targets = [], []
     for _ in range(100):
-        rewards, filled = torch.rand(4, 32, 1), torch.zeros(4, 32, 1)
+        filled = torch.zeros(4, 32, 1)
         for step in range(4):
             choice = policy(game)
             learner.record(game, *choice)
@@ -166,7 +166,7 @@ def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
             volume = game.orient(choice[0]).sides.long().prod(1)
             game.place(*choice)
             filled[step, :, 0] = (before + volume) / 1000
-        errors.append(learner.learn(1 - filled + rewards, rewards, 1e-3))
+        errors.append(learner.learn((1 - filled).squeeze(-1), 1e-3))
         targets.append(1 - filled.squeeze(-1))
     assert errors[-1] < 0.02 * errors[0]
     remembered = sorted(learner.targets.flatten().tolist())
@@ -175,7 +175,7 @@ def test_the_learner_predicts_returns_and_stores_the_last_rollouts(
     assert all(weight.grad is None for weight in critic.parameters())
     learner.record(game, *policy(game))
     with pytest.raises(ValueError, match="1 steps recorded: a rollout needs 4"):
-        learner.learn(rewards, rewards, 1e-3)
+        learner.learn(torch.zeros(4, 32), 1e-3)
 
 
 def test_the_critic_learns_at_the_first_learners_learning_rate() -> None:
@@ -192,7 +192,7 @@ def test_the_critic_learns_at_the_first_learners_learning_rate() -> None:
     game, before = Packing(8, seed=1), copies(alg.afterstates.critic)
     learner = AfterstateLearner(alg.afterstates.critic, Lookahead(), 1, 8)
     learner.record(game, *make_policy("dblf")(game))
-    learner.learn(torch.ones(1, 8, 1), torch.zeros(1, 8, 1), 0.0)
+    learner.learn(torch.ones(1, 8), 0.0)
     assert same(before, alg.afterstates.critic.state_dict())
 
 
@@ -215,7 +215,7 @@ def test_a_choice_without_a_legal_cell_is_not_learned_from() -> None:
         game.place(o, c)
     assert not learner.legal[0].all()
     returns = torch.where(learner.legal[0], 0.0, 1e6)[..., None]
-    assert learner.learn(returns, torch.zeros(8, 16, 1), 1e-3) < 1
+    assert learner.learn(returns.squeeze(-1), 1e-3) < 1
 
 
 # --- the run's one critic -------------------------------------------------------------------------

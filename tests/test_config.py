@@ -107,7 +107,7 @@ def test_settings_go_to_plain_values_and_back() -> None:
     (["--placement.frozen=true"], r"placement\.policy = null: a frozen agent needs one"),
     (["--placement.policy=dblf"], r"needs placement\.frozen"),
     (["--placement.frozen=true", "--placement.policy=dblf", "--orientation.frozen=true",
-      "--orientation.policy=random"], r"both agents are frozen"),
+      "--orientation.policy=random"], r"all agents are frozen"),
     (["--joint=true", "--placement.frozen=true", "--placement.policy=dblf"], r"cannot be frozen"),
     (["--placement.teacher=dblf"], r"placement\.teacher_iterations = 0: needs a number from 1"),
     (["--placement.teacher_iterations=-1"], r"teacher_iterations = -1: needs placement"),

@@ -22,7 +22,7 @@ from pettingzoo.test import (
 from pettingzoo.test.state_test import state_test
 from pettingzoo.utils import wrappers
 
-from marl_pack import env_aec, env_selection, env_turns
+from marl_pack import env_aec, env_cells, env_selection, env_turns
 from marl_pack.game.packing import Packing
 from marl_pack.game.spec import GameSpec, SelectionSpec
 from marl_pack.geometry import ORIENTATIONS
@@ -52,7 +52,7 @@ VARIANTS: list[dict[str, Any]] = [
 def test_the_signature_names_every_option_with_its_default(make: Any, spec: Any) -> None:
     parameters = inspect.signature(make).parameters
     for option in fields(spec):
-        assert parameters[env_aec.TAKEN.get(option.name, option.name)].default == option.default
+        assert parameters[env_cells.TAKEN.get(option.name, option.name)].default == option.default
     # What type checkers and editors read names the same arguments.
     typed = env_aec.Options.__optional_keys__
     raw = env_aec.raw_env if spec is GameSpec else env_selection.raw_env

@@ -17,7 +17,7 @@ LAYERS = (
     ("stability", "sapien_check"),
     ("exact",),
     ("game",),
-    ("env_aec", "env_mm", "env_turns", "vec_env", "agents"),
+    ("env_aec", "env_cells", "env_mm", "env_selection", "env_turns", "vec_env", "agents"),
     ("packer", "replay"),
     ("service",),
     ("evaluation",),
@@ -29,8 +29,11 @@ LAYERS = (
 # What the judge and the environment must not need.
 ONLY = {
     "sapien_check": {"bins", "checks", "extras", "files", "geometry", "plan", "sapien_check"},
-    "env_aec": {"bins", "checks", "env_mm", "env_turns", "game", "geometry", "installation",
-                "items", "option_record", "plan", "render"},
+    "env_aec": {"bins", "env_cells", "env_mm", "env_selection", "env_turns", "game", "geometry",
+                "items", "option_record", "render"},
+    "env_cells": {"checks", "env_turns", "game", "installation", "plan", "render"},
+    "env_selection": {"env_cells", "env_turns", "game", "geometry", "items", "option_record",
+                      "render"},
     "env_mm": {"checks", "env_turns", "exact", "geometry", "option_record", "plan", "render"},
     "env_turns": {"checks", "game"},
     "exact": {"checks", "exact", "explanation", "extras", "geometry", "inputs", "installation",

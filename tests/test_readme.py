@@ -10,6 +10,7 @@ DOCS = (
     "buffer",
     "physics",
     "environment",
+    "environment_selection",
     "items",
     "many_bins",
     "millimetres",

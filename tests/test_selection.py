@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from marl_pack import Packing, SearchSettings, evaluate, load
+from marl_pack.agents.afterstates.gains import gains
 from marl_pack.agents.heuristics import HEURISTICS
 from marl_pack.agents.selection.beam import Beam, best_of_each, distinct
 from marl_pack.agents.selection.beam_settings import BeamSettings
@@ -20,8 +21,8 @@ from marl_pack.agents.selection.policies import (
     GreedyValue,
     RandomSelection,
     RankedSelection,
+    SelectAs,
     SelectFirst,
-    gains,
     split,
 )
 from marl_pack.evaluation.statistics import strict_equilibrium
@@ -324,7 +325,7 @@ def test_hidden_boxes_change_no_choice(k: int, p: int, greedy: GreedyValue) -> N
     items[1, :known] = items[0, :known]
     beam = Beam(greedy.lookahead, BeamSettings(4, None))
     dblf = RankedSelection(HEURISTICS["dblf"])
-    for policy in (greedy, beam, dblf, SelectFirst(greedy.select, load("rs").policy)):
+    for policy in (greedy, beam, dblf, SelectFirst(SelectAs(greedy), load("rs").policy)):
         game = game_of(2, items=items, buffer=k, preview=p)
         for _ in range(6):
             choice = policy(game)

@@ -74,3 +74,9 @@ POLICIES = (*KEYS, "random")
 
 ORIENTATION_AGENTS = (*POLICIES, "first")
 """The heuristics that can play the orientation agent, by name."""
+
+SELECTION_AGENTS = (*POLICIES, "first")
+"""The heuristics that can play the selection agent, by name; first takes the first legal option."""
+GREEDY_VALUE = "greedy_value"
+"""The selection agent that takes the option whose best placement gains most by a critic of
+afterstates. Checkpoints have this name where a model without a selection agent plays it."""

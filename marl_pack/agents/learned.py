@@ -9,11 +9,13 @@ from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.networks.actor_critic import Actor
 from marl_pack.agents.networks.distribution import check_outputs
 from marl_pack.agents.networks.kinds import observe
+from marl_pack.agents.networks.selection import SelectionActor, observe_options
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.agents.networks.symmetry import mean_probabilities
 from marl_pack.agents.policy import AFTERSTATE_VALUE, Placement, Reasons
 from marl_pack.game.moves import Moves
 from marl_pack.game.packing import Packing
+from marl_pack.game.selection import SelectionPacking
 from marl_pack.geometry import ORIENTATIONS
 
 TINY = 1e-300
@@ -81,6 +83,23 @@ class LearnedAgent:
         if self.symmetric:
             return self.probabilities(observation).argmax(1)
         return self.best(observation)
+
+
+class LearnedSelection:
+    """A selection agent: it takes the most probable option of its network.
+
+    Args:
+        actor: the network.
+        lookahead: computes the gains of placements.
+    """
+
+    def __init__(self, actor: SelectionActor, lookahead: Lookahead) -> None:
+        self.actor, self.lookahead = actor, lookahead
+
+    @torch.inference_mode()
+    def __call__(self, game: SelectionPacking) -> Tensor:
+        """Return the most probable option, int64 [G]."""
+        return self.actor(observe_options(game, self.lookahead)).squeeze(1).long()
 
 
 class JointPolicy:

@@ -22,12 +22,12 @@ from marl_pack.agents.heuristics import (
     make_placement_agent,
     make_policy,
 )
-from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
-from marl_pack.agents.learned import JointPolicy, LearnedAgent
+from marl_pack.agents.keys import GREEDY_VALUE, ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.learned import JointPolicy, LearnedAgent, LearnedSelection
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.form import check_alike
-from marl_pack.agents.networks.actor_critic import Actor, Critic, make_actor, make_critic
-from marl_pack.agents.networks.kinds import JOINT, ORIENTATION, PLACEMENT
+from marl_pack.agents.networks.actor_critic import Critic, make_actor, make_critic
+from marl_pack.agents.networks.kinds import JOINT, ORIENTATION, PLACEMENT, SELECTION
 from marl_pack.agents.policy import (
     InTurns,
     OrientationAgent,
@@ -36,8 +36,16 @@ from marl_pack.agents.policy import (
 )
 from marl_pack.agents.search import Planner
 from marl_pack.agents.search_settings import SearchSettings
+from marl_pack.agents.selection.choosing import make_selection_agent
+from marl_pack.agents.selection.policies import (
+    GreedyValue,
+    SelectAs,
+    SelectFirst,
+    SelectionAgent,
+    first_option,
+)
 from marl_pack.agents.sources import is_own, own_policy, path_of
-from marl_pack.game.spec import GameSpec
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.geometry import Size
 from marl_pack.items import GENERATED, Stream, independent, make_stream
 
@@ -115,12 +123,29 @@ class Loader:
 
     def policy_of(self, checkpoint: Mapping[str, Any]) -> Policy:
         """Return the policy of a checkpoint, including its frozen agents."""
+        policy: Policy
         if JOINT in checkpoint["agents"]:
-            return JointPolicy(self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT))
-        return InTurns(
-            self.orientation_agent_of(checkpoints.agent_record(checkpoint, ORIENTATION)),
-            self.placement_agent_of(checkpoints.agent_record(checkpoint, PLACEMENT)),
-        )
+            policy = JointPolicy(self.learned(checkpoints.agent_record(checkpoint, JOINT), JOINT))
+        else:
+            policy = InTurns(
+                self.orientation_agent_of(checkpoints.agent_record(checkpoint, ORIENTATION)),
+                self.placement_agent_of(checkpoints.agent_record(checkpoint, PLACEMENT)),
+            )
+        if SELECTION not in checkpoint["agents"]:
+            game = SelectionSpec.of(checkpoint["config"].get("game", {}))
+            # Trained with one box and one bin, and a preview or several closings.
+            return SelectFirst(first_option, policy) if game.selects else policy
+        record = checkpoints.agent_record(checkpoint, SELECTION)
+        return SelectFirst(self.selection_agent_of(record), policy)
+
+    def selection_agent_of(self, record: Mapping[str, Any]) -> SelectionAgent:
+        """Return the selection agent that a record describes."""
+        name = record.get("name")
+        if name == GREEDY_VALUE:
+            return SelectAs(GreedyValue(self._lookahead(record)))
+        if name is not None:
+            return make_selection_agent(name, self.seed, self.device)
+        return LearnedSelection(load_actor(record, SELECTION, self.device), self._lookahead(record))
 
     def orientation_agent_of(self, record: Mapping[str, Any]) -> OrientationAgent:
         """Return the orientation agent that a record describes."""
@@ -141,9 +166,10 @@ class Loader:
 
         Args:
             record: the record of the agent.
-            name: ``orientation`` or ``placement``.
+            name: ``selection``, ``orientation`` or ``placement``.
         """
         makers: dict[str, Callable[[Mapping[str, Any]], Callable[..., Tensor]]] = {
+            SELECTION: self.selection_agent_of,
             ORIENTATION: self.orientation_agent_of,
             PLACEMENT: self.placement_agent_of,
         }
@@ -227,12 +253,12 @@ def imagined_stream(
     return independent(stream)
 
 
-def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str) -> Actor:
+def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str) -> Any:
     """Return the network of a learned agent.
 
     Args:
         record: the agent's record.
-        kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_KINDS`.
+        kind: name in :data:`marl_pack.agents.networks.kinds.AGENT_NAMES`.
         device: the device of the games.
 
     Raises:
@@ -249,7 +275,7 @@ def load_actor(record: Mapping[str, Any], kind: str, device: torch.device | str)
 
 
 def load_critic(
-    checkpoint: Mapping[str, Any], kind: str, device: torch.device | str, actor: Actor
+    checkpoint: Mapping[str, Any], kind: str, device: torch.device | str, actor: Any
 ) -> Critic:
     """Return the critic of one agent of a run.
 
@@ -268,7 +294,8 @@ def load_critic(
     with torch.random.fork_rng(devices=[]):
         critic = make_critic(kind, agent["network"], device, actor)
     critic.load_state_dict(agent["critic_state_dict"])
-    return critic.eval()
+    loaded: Critic = critic.eval()
+    return loaded
 
 
 def load_afterstate_critic(
@@ -298,7 +325,8 @@ def record_of(source: str, name: str) -> dict[str, Any]:
     Args:
         source: a heuristic's or a published model's name, or the path of a run's folder or a
             checkpoint.
-        name: ``orientation`` or ``placement``.
+        name: ``selection``, ``orientation`` or ``placement``. A model without a selection agent
+            takes the option whose best placement gains most by its critic of afterstates.
 
     Raises:
         ValueError, FileNotFoundError: if ``source`` is none of these.
@@ -307,13 +335,15 @@ def record_of(source: str, name: str) -> dict[str, Any]:
         return {"name": source}
     checkpoint = checkpoints.read(path_of(source, checkpoints.HEURISTICS[name]))
     with _with_source(source):
+        if name == SELECTION and name not in checkpoint["agents"]:
+            return checkpoints.critic_record(checkpoint, name) | {"name": GREEDY_VALUE}
         return checkpoints.agent_record(checkpoint, name)
 
 
 def trained_game(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of the game that a checkpoint's agents were trained on.
 
-    They are the options of :class:`marl_pack.game.spec.GameSpec`, ``items`` and ``sides``.
+    They are the options of :class:`marl_pack.game.spec.SelectionSpec`, ``items`` and ``sides``.
 
     Raises:
         ValueError: if a value is impossible, or a setting is missing that every version of
@@ -323,7 +353,7 @@ def trained_game(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     for key in ("bin", "rule", "items", "sides"):
         if key not in game:
             raise ValueError(f"config.game.{key} is missing")
-    return GameSpec.of(game).to_dict() | {key: game[key] for key in ("items", "sides")}
+    return SelectionSpec.of(game).to_dict() | {key: game[key] for key in ("items", "sides")}
 
 
 def trained_on(checkpoint: Mapping[str, Any]) -> str:
@@ -335,9 +365,8 @@ def trained_on(checkpoint: Mapping[str, Any]) -> str:
     game, seed = trained_game(checkpoint), checkpoint["config"].get("seed", "unknown")
     is_file = "." in game["items"]  # names of generated streams have no dot
     sides = "" if is_file else f" {game['sides'][0]}-{game['sides'][1]}"
-    return (
-        f"{game['items']}{sides}, {GameSpec.of(game)}, {checkpoint['items']:,} items, seed {seed}"
-    )
+    spec, items = SelectionSpec.of(game), checkpoint["items"]
+    return f"{game['items']}{sides}, {spec}, {items:,} items, seed {seed}"
 
 
 @contextlib.contextmanager

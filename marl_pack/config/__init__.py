@@ -2,7 +2,7 @@
 
 from marl_pack.config.checks import ConfigError
 from marl_pack.config.parsing import from_dict, keys, make_parser, parse
-from marl_pack.config.schema import Agent, Config, Evaluation, Game, Output
+from marl_pack.config.schema import Agent, Config, Evaluation, Game, Output, Selection
 
 __all__ = [
     "Agent",
@@ -11,6 +11,7 @@ __all__ = [
     "Evaluation",
     "Game",
     "Output",
+    "Selection",
     "from_dict",
     "keys",
     "make_parser",

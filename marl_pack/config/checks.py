@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES, SELECTION_AGENTS
 from marl_pack.checks import LARGEST_SEED, shown
-from marl_pack.config.schema import Agent, Config
+from marl_pack.config.schema import Agent, Config, Selection
 from marl_pack.options import MOST_AT_ONCE
 
 
@@ -34,6 +34,8 @@ class Range(NamedTuple):
 MANY, SEEDS, SHARE = Range(1, 10**9), Range(0, LARGEST_SEED), Range(0, 1)
 FASTEST = 1e30  # learning rate; optimisers divide it, and float32 ends at 3e38
 POSITIVE, NOT_NEGATIVE = Range(0, 1e38, open=True), Range(0, 1e38)
+AGENTS = {"selection": SELECTION_AGENTS, "orientation": ORIENTATION_AGENTS, "placement": POLICIES}
+"""The heuristics that can play each agent, by the agent's name."""
 RANGES = {
     "seed": SEEDS,
     "threads": Range(1, MOST_AT_ONCE),
@@ -58,11 +60,11 @@ RANGES = {
     "output.keep_every": MANY,
     **{
         f"{agent}.{key}": NOT_NEGATIVE
-        for agent in ("orientation", "placement")
+        for agent in AGENTS
         for key in ("entropy_coef", "final_entropy_coef")
     },
-    **{f"{agent}.teacher_random": SHARE for agent in ("orientation", "placement")},
-    **{f"{agent}.learning_rate": Range(0, FASTEST) for agent in ("orientation", "placement")},
+    **{f"{agent}.teacher_random": SHARE for agent in AGENTS},
+    **{f"{agent}.learning_rate": Range(0, FASTEST) for agent in AGENTS},
 }
 """The range of each setting; the records of the game and of networks check their own fields."""
 
@@ -111,10 +113,10 @@ def check_output(config: Config) -> None:
 
 
 def check_agents(config: Config) -> None:
-    """Refuse impossible settings of the two agents."""
-    for name, agent in (("orientation", config.orientation), ("placement", config.placement)):
+    """Refuse impossible settings of the agents."""
+    agents: list[Agent | Selection] = [config.selection, config.orientation, config.placement]
+    for (name, heuristics), agent in zip(AGENTS.items(), agents, strict=True):
         if agent.frozen and agent.policy is None:
-            heuristics = POLICIES if name == "placement" else ORIENTATION_AGENTS
             refuse(
                 f"{name}.policy", "null",
                 f"a frozen agent needs one: {', '.join(heuristics)}, a published model, or a run's "
@@ -122,16 +124,22 @@ def check_agents(config: Config) -> None:
             )  # fmt: skip
         if not agent.frozen and agent.policy is not None:
             refuse(f"{name}.policy", agent.policy, f"needs {name}.frozen: true")
-        if (agent.frozen or agent.policy) and config.joint:
+        if (agent.frozen or agent.policy) and config.joint and name != "selection":
             refuse(f"{name}.frozen", "true", "the joint agent cannot be frozen in part")
         check_teacher(name, agent, config)
-    if config.orientation.frozen and config.placement.frozen:
-        refuse("placement.frozen", "true", "both agents are frozen, so nothing would learn")
+    selects = config.game.buffer * config.game.bins > 1
+    if not selects and config.selection != Selection():
+        raise ConfigError(
+            "selection: needs game.buffer or game.bins of more than 1; otherwise there is nothing "
+            "to select"
+        )
+    if all(agent.frozen for agent in agents[not selects :]):
+        refuse("placement.frozen", "true", "all agents are frozen, so nothing would learn")
     if config.joint and not config.game.mask_orientations:
         refuse("game.mask_orientations", "false", "the joint agent's pairs are always masked")
 
 
-def check_teacher(name: str, agent: Agent, config: Config) -> None:
+def check_teacher(name: str, agent: Agent | Selection, config: Config) -> None:
     """Refuse a teacher without a number of iterations, or without a learner that can clone it.
 
     Raises:
@@ -149,7 +157,7 @@ def check_teacher(name: str, agent: Agent, config: Config) -> None:
         raise ConfigError(
             f"{key}: a frozen agent does not learn; give {name}.teacher null and {duration} 0"
         )
-    if config.joint:
+    if config.joint and name != "selection":
         raise ConfigError(f"{key}: the joint agent clones no teacher")
     if config.ppo.normalize_advantage_per_mini_batch:
         raise ConfigError(f"{key}: needs ppo.normalize_advantage_per_mini_batch: false")

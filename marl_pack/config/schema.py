@@ -10,16 +10,16 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from marl_pack.agents.keys import POLICIES
-from marl_pack.agents.networks.shape import Network
-from marl_pack.game.spec import GameSpec
+from marl_pack.agents.networks.shape import Network, SelectionNetwork
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.items import DEFAULT_SIDES
 from marl_pack.option_record import document
 
 
-@document(GameSpec, " " * 8)
+@document(SelectionSpec, " " * 8)
 @dataclass(frozen=True)
-class Game(GameSpec):
-    """The packing game (docs/environment.md).
+class Game(SelectionSpec):
+    """The packing game (docs/environment.md, docs/buffer.md).
 
     Args:
         {options}
@@ -39,8 +39,39 @@ class Game(GameSpec):
 
 
 @dataclass
+class Selection:
+    """The agent that selects a box and a bin, in games with several to choose from.
+
+    Args:
+        frozen: whether it plays without learning.
+        policy: the policy of a frozen agent: {policies}, first (the first box that has a place), or
+            a published model, a run's folder or checkpoint; a model without a selection agent takes
+            what gains most by its critic of afterstates.
+        network: shape of its network.
+        teacher: the policy whose choices the agent clones at first, named like policy; null for
+            none.
+        teacher_iterations: number of iterations in which it clones the teacher.
+        teacher_random: share of the teacher's choices that are random instead, 0 to 1.
+        learning_rate: the agent's own learning rate; null for ppo.learning_rate.
+        entropy_coef: the agent's own entropy bonus; null for ppo.entropy_coef.
+        final_entropy_coef: the agent's own entropy bonus at the end; null for
+            ppo.final_entropy_coef.
+    """
+
+    frozen: bool = False
+    policy: str | None = None
+    network: SelectionNetwork = field(default_factory=SelectionNetwork)
+    teacher: str | None = None
+    teacher_iterations: int = 0
+    teacher_random: float = 0.1
+    learning_rate: float | None = None
+    entropy_coef: float | None = None
+    final_entropy_coef: float | None = None
+
+
+@dataclass
 class Agent:
-    """One of the two agents.
+    """The orientation agent or the placement agent.
 
     Args:
         frozen: whether it plays without learning.
@@ -68,7 +99,8 @@ class Agent:
     final_entropy_coef: float | None = None
 
 
-Agent.__doc__ = (Agent.__doc__ or "").replace("{policies}", ", ".join(POLICIES))
+for _agent in (Selection, Agent):
+    _agent.__doc__ = (_agent.__doc__ or "").replace("{policies}", ", ".join(POLICIES))
 
 
 @dataclass
@@ -175,6 +207,8 @@ class Config:
         init: a published model, a run's folder or a checkpoint; the learning agents begin with its
             weights; null for new weights.
         game: the game.
+        selection: the agent that selects a box and a bin first; it plays only where game.buffer or
+            game.bins is more than 1.
         orientation: the agent that chooses the orientation.
         placement: the agent that places the item.
         ppo: how the agents learn.
@@ -188,6 +222,7 @@ class Config:
     joint: bool = False
     init: str | None = None
     game: Game = field(default_factory=Game)
+    selection: Selection = field(default_factory=Selection)
     orientation: Agent = field(default_factory=Agent)
     placement: Agent = field(default_factory=Agent)
     ppo: PPO = field(default_factory=PPO)

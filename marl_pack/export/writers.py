@@ -31,7 +31,7 @@ from marl_pack.agents.loading import (
     trained_game,
 )
 from marl_pack.agents.networks.actor_critic import Actor
-from marl_pack.agents.networks.kinds import AGENT_KINDS, observe
+from marl_pack.agents.networks.kinds import AGENT_KINDS, SELECTION, observe
 from marl_pack.agents.networks.planes import ALWAYS_OBSERVED, PLANES, Meaning
 from marl_pack.config import from_dict
 from marl_pack.files import write_atomically
@@ -285,6 +285,9 @@ def run(source: str, folder: Path | None, form: str, console: Console) -> None:
         )
     training = training_facts(checkpoint)
     for name, agent in checkpoint["agents"].items():
+        if name == SELECTION:
+            console.print("selection: left out, only agents on a bin are exported", soft_wrap=True)
+            continue
         learned = "critic_state_dict" in agent
         if form == "rsl_rl" and learned and "optimizer_state_dict" not in agent:
             state = fresh_optimizer(checkpoint, name)

@@ -15,15 +15,17 @@ import torch
 from marl_pack.agents.afterstates.critic import AfterstateCritic
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.learning import checkpoint as checkpoints
+from marl_pack.agents.learning.ppo import first_observation
 from marl_pack.agents.learning.runner import Runner
 from marl_pack.agents.loading import Loader, record_of
-from marl_pack.agents.networks.kinds import JOINT, TWO_AGENTS, observe
+from marl_pack.agents.networks.kinds import JOINT, SELECTION, TWO_AGENTS
 from marl_pack.agents.networks.planes import need_critic
 from marl_pack.bins import check_device
-from marl_pack.config import Agent, Config, ConfigError
+from marl_pack.config import Agent, Config, ConfigError, Selection
 from marl_pack.evaluation.rollout import play
 from marl_pack.evaluation.statistics import mean_utilization
 from marl_pack.game.packing import Packing
+from marl_pack.game.selection import SelectionPacking
 from marl_pack.items import Stream, choose_stream
 from marl_pack.vec_env import PackingVecEnv
 
@@ -71,19 +73,23 @@ def make_stream(config: Config) -> Stream:
 
 def make_game(
     config: Config, n: int, seed: int, *, auto_reset: bool, device: str, first_episode: int = 0
-) -> Packing:
+) -> Packing | SelectionPacking:
     """Return ``n`` games with the options in the settings."""
-    return Packing(
+    kind = SelectionPacking if config.game.selects else Packing
+    return kind(
         n, items=make_stream(config), spec=config.game, auto_reset=auto_reset, device=device,
         seed=seed, first_episode=first_episode,
     )  # fmt: skip
 
 
-def agents_of(config: Config) -> dict[str, Agent]:
+def agents_of(config: Config) -> dict[str, Agent | Selection]:
     """Return the settings of the agents that play, by name, in the order of their turns."""
+    agents: dict[str, Agent | Selection] = {}
+    if config.game.buffer * config.game.bins > 1:
+        agents[SELECTION] = config.selection
     if config.joint:
-        return {JOINT: config.placement}
-    return {name: getattr(config, name) for name in TWO_AGENTS}
+        return agents | {JOINT: config.placement}
+    return agents | {name: getattr(config, name) for name in TWO_AGENTS}
 
 
 def other_agents(
@@ -135,7 +141,7 @@ def runner_settings(
     ppo.pop("num_envs")
     ppo["schedule"] = "adaptive" if schedule == "adaptive" else "fixed"
 
-    def learner(name: str, agent: Agent) -> dict[str, Any]:
+    def learner(name: str, agent: Agent | Selection) -> dict[str, Any]:
         rate = ppo["learning_rate"] if agent.learning_rate is None else agent.learning_rate
         entropy = ppo["entropy_coef"] if agent.entropy_coef is None else agent.entropy_coef
         last = final_entropy if agent.final_entropy_coef is None else agent.final_entropy_coef
@@ -207,11 +213,9 @@ def make_runner(
             config, config.ppo.num_envs, derived_seed(config.seed, rank()), auto_reset=True,
             device=device,
         )  # fmt: skip
-        planes = {
-            name: agent["network"]["planes"] if "network" in agent else []
-            for name, agent in settings["agents"].items()
-        }
-        critic = AfterstateCritic().to(device) if any(map(need_critic, planes.values())) else None
+        learners = {n: a["network"] for n, a in settings["agents"].items() if "network" in a}
+        values = any(n == SELECTION or need_critic(a["planes"]) for n, a in learners.items())
+        critic = AfterstateCritic().to(device) if values else None
         lookahead = Lookahead(critic)
         loader = Loader(device, None, memo=lookahead.memo)
         settings["algorithm"] |= {
@@ -219,9 +223,12 @@ def make_runner(
             "frozen": {name: loader.agent_of(record, name) for name, record in frozen.items()},
             "teachers": {name: loader.agent_of(record, name) for name, record in teachers.items()},
         }
-        first = next(iter(planes))
+        first = next(iter(settings["agents"]))
+        planes = learners.get(first, {}).get("planes", ())
         env = PackingVecEnv(
-            game, lambda games: observe(first, games, planes[first], lookahead), config
+            game,
+            lambda games: first_observation(first, games, planes, lookahead, first in learners),
+            config,
         )
         runner = Runner(env, settings, folder, device, config=config.to_dict(), **reports)
         torch.manual_seed(derived_seed(config.seed, rank(), 1))  # processes draw different actions
@@ -243,7 +250,7 @@ def evaluation(config: Config, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     device = local_device(config)
     policy = Loader(device, config.evaluation.seed).policy_of(checkpoint)
 
-    def game(n: int, first_episode: int) -> Packing:
+    def game(n: int, first_episode: int) -> Any:
         return make_game(
             config, n, config.evaluation.seed, auto_reset=False, device=device,
             first_episode=first_episode,

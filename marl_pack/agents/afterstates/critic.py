@@ -86,14 +86,11 @@ class AfterstateLearner:
         self.legal[position] = Moves.gather(game.mask, orientation, cell)  # false: no box
         self.step += 1
 
-    def learn(
-        self, returns: Tensor, rewards: Tensor, learning_rate: float, processes: int = 1
-    ) -> float:
+    def learn(self, targets: Tensor, learning_rate: float, processes: int = 1) -> float:
         """Fit the critic to the recorded rollouts; call this at the end of each rollout.
 
         Args:
-            returns: float32 [T, G, 1], the return of each placement, its reward included.
-            rewards: float32 [T, G, 1], the reward of each placement.
+            targets: float32 [T, G], the return that was still to come after each placement.
             learning_rate: the learning rate in this update.
             processes: number of processes that learn together and average their gradients.
 
@@ -107,13 +104,13 @@ class AfterstateLearner:
             raise ValueError(f"{self.step} steps recorded: a rollout needs {self.inputs.shape[1]}")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
-        self.targets[self.rollouts % self.capacity] = (returns - rewards).squeeze(-1)
+        self.targets[self.rollouts % self.capacity] = targets
         self.rollouts, self.step = self.rollouts + 1, 0
         stored = min(self.rollouts, self.capacity)
         inputs, targets = self.inputs[:stored].flatten(0, 2), self.targets[:stored].flatten()
         legal = self.legal[:stored].flatten().float()
         total = torch.zeros((), device=inputs.device)
-        updates = -(-PASSES * returns.numel() // MINIBATCH)
+        updates = -(-PASSES * self.inputs.shape[1] * self.inputs.shape[2] // MINIBATCH)
         for _ in range(updates):
             sample = torch.randint(len(inputs), (MINIBATCH,), device=inputs.device)
             error = (self.critic(inputs[sample].float()) - targets[sample]).square()

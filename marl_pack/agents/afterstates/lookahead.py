@@ -199,7 +199,8 @@ class Lookahead:
 
     def forget_values(self) -> None:
         """Delete the values of afterstates, after the critic has learned."""
-        self.memo.forget(("afterstate_value", self.critic))
+        for name in ("afterstate_value", "values_before"):
+            self.memo.forget((name, self.critic))
 
     def branch(self, game: Packing, games: Tensor) -> Packing:
         """Return ``game.branch(games)``, and select the turn's results for it."""

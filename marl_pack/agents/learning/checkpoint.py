@@ -32,7 +32,12 @@ import torch
 from torch import Tensor
 
 from marl_pack.agents.afterstates.lookahead import value_share_at
-from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
+from marl_pack.agents.keys import (
+    GREEDY_VALUE,
+    ORIENTATION_AGENTS,
+    POLICIES,
+    SELECTION_AGENTS,
+)
 from marl_pack.agents.learning import migration
 from marl_pack.agents.learning.form import (
     Plain,
@@ -40,10 +45,10 @@ from marl_pack.agents.learning.form import (
     check_form,
     check_no_tensors,
 )
-from marl_pack.agents.networks.actor_critic import make_actor, make_critic
-from marl_pack.agents.networks.kinds import AGENT_KINDS, ORIENTATION, PLACEMENT
+from marl_pack.agents.networks.actor_critic import make_actor, make_critic, shape_of
+from marl_pack.agents.networks.kinds import AGENT_NAMES, ORIENTATION, PLACEMENT, SELECTION
 from marl_pack.agents.networks.planes import need_critic
-from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.shape import Network, SelectionNetwork
 from marl_pack.agents.sources import BEST as BEST
 from marl_pack.agents.sources import LATEST as LATEST
 from marl_pack.agents.sources import resolve as resolve
@@ -54,7 +59,9 @@ FORMAT = 2
 MOST_SHARED = 4
 """How often a checkpoint may contain the same tensor, on average."""
 
-HEURISTICS = {ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES}
+HEURISTICS = {
+    SELECTION: SELECTION_AGENTS, ORIENTATION: ORIENTATION_AGENTS, PLACEMENT: POLICIES,
+}  # fmt: skip
 """Heuristics that can play an agent, by the agent's name."""
 
 NOTHING = type(None)
@@ -73,9 +80,9 @@ FORM = {
         "seed": int,
         "game": {"bin": [int, int, int], "items": str, "sides": [int, int]},
         "ppo": {"gamma": float, "afterstate_ramp": [int, int]},
-        "orientation": _SETTINGS, "placement": _SETTINGS,
+        "selection": _SETTINGS, "orientation": _SETTINGS, "placement": _SETTINGS,
     },
-    "agents": dict.fromkeys(AGENT_KINDS, _AGENT),
+    "agents": dict.fromkeys(AGENT_NAMES, _AGENT),
     "afterstate_critic": _WEIGHTS, "afterstate_optimizer": _OPTIMIZER, "afterstates": _OPTIMIZER,
     "iter": int, "items": int, "seconds": float, "schedule_iteration": int,
     "evaluations": [{str: (float, NOTHING)}],
@@ -155,9 +162,9 @@ def _checked(content: Any, size: int) -> dict[str, Any]:
     check_no_tensors(checkpoint["config"], "config")
     for key, low in (("iter", -1), ("items", 0)):
         whole_number(checkpoint[key], key, low)
-    unknown = [name for name in checkpoint["agents"] if name not in AGENT_KINDS]
+    unknown = [name for name in checkpoint["agents"] if name not in AGENT_NAMES]
     if unknown:
-        raise ValueError(f"agents: {shown(unknown[0])} is none of {', '.join(AGENT_KINDS)}")
+        raise ValueError(f"agents: {shown(unknown[0])} is none of {', '.join(AGENT_NAMES)}")
     if checkpoint["format"] == 1:
         checkpoint = migration.from_format_1(checkpoint)
     checkpoint = migration.without_removed(checkpoint)
@@ -172,7 +179,10 @@ def _check_player(record: Mapping[str, Any], agent: str, where: str) -> None:
     """Refuse the record of an agent that has neither a heuristic's name nor a network."""
     if "name" in record:
         names = HEURISTICS.get(agent, ())
-        if record["name"] not in names:
+        by_value = agent == SELECTION and record["name"] == GREEDY_VALUE
+        if by_value and "afterstate_critic" not in record:
+            raise ValueError(f"{where}.afterstate_critic is missing")
+        if record["name"] not in names and not by_value:
             raise ValueError(f"{where}.name: {shown(record['name'])} is none of {', '.join(names)}")
         return
     for part in ("network", "actor_state_dict"):
@@ -224,13 +234,27 @@ def agent_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
     agent = agent_of(checkpoint, name)
     parts = ("name", "network", "actor_state_dict", "afterstate_critic", "value_share")
     record = {key: value for key, value in agent.items() if key in parts}
-    sees_values = need_critic(record.get("network", {}).get("planes", ()))
+    network = record.get("network", {})
+    sees_values = need_critic(network.get("planes", ())) or (name == SELECTION and network)
     if sees_values and "afterstate_critic" not in record:
-        if "afterstate_critic" not in checkpoint:
-            raise ValueError(f"the {name} agent observes values: afterstate_critic is missing")
-        record["afterstate_critic"] = checkpoint["afterstate_critic"]
-        record["value_share"] = value_share(checkpoint)
+        record |= critic_record(checkpoint, name)
     return record
+
+
+def critic_record(checkpoint: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the critic of afterstates of a checkpoint, as it stands in the record of an agent.
+
+    Args:
+        checkpoint: as :func:`read` returns it.
+        name: the agent's name, for messages.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if "afterstate_critic" not in checkpoint:
+        raise ValueError(f"the {name} agent observes values: afterstate_critic is missing")
+    share = value_share(checkpoint)
+    return {"afterstate_critic": checkpoint["afterstate_critic"], "value_share": share}
 
 
 def value_share(checkpoint: Mapping[str, Any]) -> float:
@@ -240,7 +264,7 @@ def value_share(checkpoint: Mapping[str, Any]) -> float:
     return value_share_at(ramp, done)
 
 
-def check_weights(record: Mapping[str, Any], name: str) -> Network:
+def check_weights(record: Mapping[str, Any], name: str) -> Network | SelectionNetwork:
     """Return the shape of an agent's network; refuse weights that do not fit it.
 
     The check takes no memory for the network, because a damaged file may give it any shape.
@@ -254,9 +278,9 @@ def check_weights(record: Mapping[str, Any], name: str) -> Network:
             or type.
     """
     try:
-        network = Network(**record["network"])
+        network = shape_of(name, record["network"])
         weights = record["actor_state_dict"]
-        if network.layers > len(weights):
+        if isinstance(network, Network) and network.layers > len(weights):
             raise ValueError(f"{network.layers} layers need more than {len(weights)} tensors")
         with torch.device("meta"):
             actor = make_actor(name, record["network"], "meta")

@@ -1,10 +1,13 @@
 """PPO for agents that take turns: each has a stock rsl_rl ``PPO``; the runner sees one algorithm.
 
 Within a step the orientation agent acts first. The placement agent then observes the item in the
-chosen orientation and acts. Both store the same reward and the same end of episode (Eq. 3 – 5);
-each computes its advantages over its own turns. A frozen agent plays without learning. An agent
-that clones a teacher plays as the teacher does; all its choices have the same advantage, so that
-PPO makes them more probable.
+chosen orientation and acts. Where there are several boxes or bins, the selection agent acts before
+them, and they see the selected box and bin (:class:`Step`).
+
+All agents store the same reward and the same end of episode (Eq. 3 – 5); each computes its
+advantages over its own turns. A frozen agent plays without learning. An agent that clones a teacher
+plays as the teacher does; all its choices have the same advantage, so that PPO makes them more
+probable.
 """
 
 from __future__ import annotations
@@ -22,13 +25,24 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
+from marl_pack.agents.afterstates.gains import values_before
 from marl_pack.agents.afterstates.lookahead import Lookahead, value_share_at
+from marl_pack.agents.learning.bin_returns import BinReturns
 from marl_pack.agents.learning.cloning import Teacher
-from marl_pack.agents.networks.actor_critic import Actor, Critic
-from marl_pack.agents.networks.kinds import AGENT_KINDS, AgentKind, Choice, observe
+from marl_pack.agents.networks.actor_critic import models_of
+from marl_pack.agents.networks.kinds import (
+    AGENT_KINDS,
+    PLACEMENT,
+    SELECTION,
+    AgentKind,
+    Choice,
+    observe,
+)
 from marl_pack.agents.networks.planes import encode_observation
+from marl_pack.agents.networks.selection import observe_options
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.game.packing import Packing
+from marl_pack.game.selection import SelectionPacking
 from marl_pack.vec_env import PackingVecEnv
 
 KL_SAMPLES = 256  # states on which the KL divergence of an update is measured
@@ -39,7 +53,7 @@ class Seat:
     """One agent's place in a step: a learner with its PPO, or an agent that is frozen.
 
     Args:
-        kind: the agent's kind.
+        name: the agent's name.
         ppo: a learner's PPO; None for a frozen agent.
         frozen: a frozen agent: games and earlier choices of the turn → actions int64 [G].
         planes: extra planes that a learner observes.
@@ -47,46 +61,49 @@ class Seat:
         teacher: the teacher whose choices a learner clones in its first iterations.
     """
 
-    kind: AgentKind
+    name: str
     ppo: PPO | None = None
     frozen: Callable[..., Tensor] | None = None
     planes: Sequence[str] = ()
     schedule: Mapping[str, Any] | None = None
     teacher: Teacher | None = None
 
+    @property
+    def kind(self) -> AgentKind | None:
+        """The agent's kind; None for the selection agent, which does not act on one bin."""
+        return AGENT_KINDS.get(self.name)
+
     def teacher_at(self, iteration: int) -> Teacher | None:
         """Return the teacher that the learner clones in an iteration, None if there is none."""
         teacher = self.teacher
         return teacher if teacher and iteration < teacher.iterations else None
 
-    def act(self, observation: TensorDict, game: Packing, before: Choice, iteration: int) -> Tensor:
+    def act(self, observation: TensorDict, step: Step, iteration: int) -> Tensor:
         """Return the actions int64 [G]; a learner records them in its storage."""
         if self.ppo is None:
-            return self._play_frozen(game, before)
+            return self._play_frozen(step)
         action = self.ppo.act(observation)
         teacher = self.teacher_at(iteration)
         if teacher is None:
             return action.squeeze(1).long()
-        actions = teacher(game, *before)
+        actions = teacher(step.table, *step.choice)
         recorded = actions.unsqueeze(1).to(action.dtype)
         self.ppo.transition.actions = recorded
         self.ppo.transition.actions_log_prob = self.ppo.actor.get_output_log_prob(recorded).detach()
         return actions
 
-    def draw(
-        self, observation: TensorDict, game: Packing, before: Choice, iteration: int
-    ) -> Tensor:
+    def draw(self, observation: TensorDict, step: Step, iteration: int) -> Tensor:
         """Return actions int64 [G] as :meth:`act` would, without recording them."""
         if self.ppo is None:
-            return self._play_frozen(game, before)
+            return self._play_frozen(step)
         teacher = self.teacher_at(iteration)
         if teacher is not None:
-            return teacher(game, *before)
+            return teacher(step.table, *step.choice)
         return self.ppo.actor(observation, stochastic_output=True).squeeze(1).long()
 
-    def _play_frozen(self, game: Packing, before: Choice) -> Tensor:
+    def _play_frozen(self, step: Step) -> Tensor:
         assert self.frozen is not None, "an agent that does not learn is frozen"
-        return self.frozen(game, *before)
+        return self.frozen(step.table, *step.choice)
 
     def anneal(self, progress: float) -> None:
         """Set learning rate and entropy bonus for ``progress``, the share 0 … 1 of the run done."""
@@ -100,6 +117,51 @@ class Seat:
                 group["lr"] = self.ppo.learning_rate
 
 
+class Step:
+    """The choices so far in a step of G games, and the games as the next agent sees them.
+
+    After the selection agent, the next agents see a game of one box and one bin.
+
+    Args:
+        game: the games.
+        lookahead: its results for all options are used for the selected ones.
+
+    Attributes:
+        table: the games as the next agent sees them.
+        option: the selected options, int64 [G]; None in games without selection.
+        choice: the orientations and the cells chosen so far.
+    """
+
+    def __init__(self, game: Packing | SelectionPacking, lookahead: Lookahead) -> None:
+        self.game, self.lookahead = game, lookahead
+        self.table: Any = game
+        self.option: Tensor | None = None
+        self.choice: Choice = ()
+        if isinstance(game, SelectionPacking) and game.options == 1:
+            self.select(torch.zeros(game.n, dtype=torch.int64, device=game.device))
+
+    def select(self, option: Tensor) -> None:
+        """Show the next agents the boxes and bins of options, int64 [G]."""
+        game = self.game
+        assert isinstance(game, SelectionPacking), "only these games have options"
+        rows, self.option = game.rows(option), option
+        self.table = game.view(rows)
+        self.lookahead.memo.follow(game.view(), rows, self.table)
+
+    def add(self, seat: Seat, action: Tensor) -> None:
+        """Add the action of an agent, int64 [G]."""
+        if seat.kind is None:
+            self.select(action)
+        else:
+            self.choice = seat.kind.extend(self.choice, action, self.game.floor)
+
+    @property
+    def actions(self) -> Tensor:
+        """All choices, int64 [G, 2], or [G, 3] with the options first."""
+        selected = () if self.option is None else (self.option,)
+        return torch.stack((*selected, *self.choice), 1)
+
+
 class PackingPPO:
     """The algorithm for rsl_rl's ``OnPolicyRunner``: all learners and the critic of afterstates.
 
@@ -110,6 +172,7 @@ class PackingPPO:
         iterations: number of iterations of the run, for the schedules.
         afterstates: fits the critic of afterstates; None if no agent observes its values.
         afterstate_ramp: see :func:`marl_pack.agents.afterstates.lookahead.value_share_at`.
+        bin_returns: records the rewards of each bin, for ``afterstates`` in games with selection.
 
     Raises:
         ValueError: if no agent learns.
@@ -125,11 +188,14 @@ class PackingPPO:
         iterations: int,
         afterstates: AfterstateLearner | None = None,
         afterstate_ramp: Sequence[int] = (0, 0),
+        bin_returns: BinReturns | None = None,
     ) -> None:
         self.seats = list(seats)
-        self.learners = {seat.kind.name: seat.ppo for seat in self.seats if seat.ppo is not None}
+        self.learners = {seat.name: seat.ppo for seat in self.seats if seat.ppo is not None}
         if not self.learners:
-            raise ValueError("both agents are frozen: nothing would learn")
+            raise ValueError("all agents are frozen: nothing would learn")
+        self.bin_returns = bin_returns
+        self._bin = torch.zeros(0, dtype=torch.int64)  # of the last placements
         self.env, self.lookahead = env, lookahead
         self.iterations, self.afterstate_ramp = iterations, afterstate_ramp
         self.afterstates = afterstates
@@ -148,40 +214,43 @@ class PackingPPO:
 
     # --- the rollout ------------------------------------------------------------------------------
 
-    def _observation(self, seat: Seat, before: Choice, first: TensorDict) -> TensorDict:
+    def _observation(self, seat: Seat, step: Step, first: TensorDict) -> TensorDict:
         """Return what a learner observes at its turn: ``first`` if its turn is the first.
 
         It is encoded here, once for acting and for all passes of the update.
         """
-        if seat.ppo is None:
+        if seat.ppo is None or seat.kind is None:
             return first
-        game = self.env.game
-        observation = first
-        if before:
-            observation = observe(seat.kind.name, game, seat.planes, self.lookahead, *before)
+        observation: Observation = first
+        if seat is not self.seats[0]:
+            observation = observe(
+                seat.name, step.table, seat.planes, self.lookahead, *step.choice
+            )  # fmt: skip
         return _encoded(observation, seat.planes)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Return the chosen orientations and cells, int64 [G, 2]; record the learners' choices.
+        """Return the choices, int64 [G, 2], or [G, 3] with the options first; record the learners'.
 
         Args:
             obs: as the environment's ``get_observations`` returns it.
         """
         game = self.env.game
-        choice: Choice = ()
+        step = Step(game, self.lookahead)
         for seat in self.seats:
-            observation = self._observation(seat, choice, obs)
-            action = seat.act(observation, game, choice, self.iteration)
-            choice = seat.kind.extend(choice, action, game.floor)
+            observation = self._observation(seat, step, obs)
+            step.add(seat, seat.act(observation, step, self.iteration))
         if self.afterstates is not None:
-            orientation, cell = choice
-            self.afterstates.record(game, orientation, cell)
-        return torch.stack(choice, 1)
+            self.afterstates.record(step.table, *step.choice)
+        if isinstance(game, SelectionPacking) and step.option is not None:
+            self._bin = step.option % game.b
+        return step.actions
 
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
     ) -> None:
         """Record the reward of a step, which all agents share."""
+        if self.bin_returns is not None:
+            self.bin_returns.record(self._bin, rewards, extras["closed"])
         for ppo in self.learners.values():
             ppo.process_env_step(obs, rewards, dones, extras)
 
@@ -192,11 +261,10 @@ class PackingPPO:
         earlier agents in that turn are drawn, but not recorded.
         """
         self._last = obs
-        game = self.env.game
-        choice: Choice = ()
+        step = Step(self.env.game, self.lookahead)
         remaining = len(self._learning)
         for seat in self.seats:
-            observation = self._observation(seat, choice, obs)
+            observation = self._observation(seat, step, obs)
             if seat.ppo is not None:
                 seat.ppo.compute_returns(observation)
                 remaining -= 1
@@ -205,8 +273,7 @@ class PackingPPO:
                     storage.advantages = torch.ones_like(storage.advantages)
             if not remaining:
                 break
-            action = seat.draw(observation, game, choice, self.iteration)
-            choice = seat.kind.extend(choice, action, game.floor)
+            step.add(seat, seat.draw(observation, step, self.iteration))
 
     # --- the update -------------------------------------------------------------------------------
 
@@ -225,7 +292,7 @@ class PackingPPO:
         if self.afterstates is not None:
             losses["afterstates"] = self._learn_afterstates(self.afterstates)
         for seat in self._learning:
-            name, ppo = seat.kind.name, seat.ppo
+            name, ppo = seat.name, seat.ppo
             assert ppo is not None, "it learns"
             losses |= {f"{name}/{key}": value for key, value in ppo.update().items()}
             losses[f"{name}/kl"] = self._divergence(ppo)
@@ -237,11 +304,18 @@ class PackingPPO:
         return losses
 
     def _learn_afterstates(self, learner: AfterstateLearner) -> float:
-        """Fit the critic of afterstates to the returns of the first learner."""
+        """Fit the critic of afterstates to the returns of the first learner, or of each bin."""
         ppo = next(iter(self.learners.values()))
         processes = ppo.gpu_world_size if ppo.is_multi_gpu else 1
-        storage = ppo.storage
-        return learner.learn(storage.returns, storage.rewards, ppo.learning_rate, processes)
+        game, storage = self.env.game, ppo.storage
+        if self.bin_returns is not None:
+            assert isinstance(game, SelectionPacking), "only these games have several bins"
+            with torch.inference_mode():
+                open_bins = values_before(game, self.lookahead)[:, : game.b]
+            targets = self.bin_returns.targets(open_bins, ppo.gamma)
+        else:
+            targets = (storage.returns - storage.rewards).squeeze(-1)
+        return learner.learn(targets, ppo.learning_rate, processes)
 
     @staticmethod
     def _divergence(ppo: PPO) -> float:
@@ -339,34 +413,62 @@ class PackingPPO:
         lookahead: Lookahead = algorithm.pop("lookahead")
         frozen, teachers = algorithm.pop("frozen"), algorithm.pop("teachers")
         seats = []
+        game = env.game
+        zeros = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
         for name, settings in cfg["agents"].items():
-            kind = AGENT_KINDS[name]
             if name in frozen:
-                seats.append(Seat(kind, frozen=frozen[name]))
+                seats.append(Seat(name, frozen=frozen[name]))
                 continue
-            planes = settings["network"]["planes"]
-            zeros = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
-            before = (zeros,) if seats else ()
-            example = observe(name, env.game, planes, lookahead, *before)
-            example = _encoded(example, planes)
+            planes = settings["network"].get("planes", ())
+            if name == SELECTION:
+                assert isinstance(game, SelectionPacking), "there is something to select"
+                observed = observe_options(game, lookahead)
+                example = TensorDict(observed, batch_size=[game.n], device=game.device)
+            else:
+                table = game.view(game.rows(zeros)) if isinstance(game, SelectionPacking) else game
+                before = (zeros,) if name == PLACEMENT else ()
+                example = _encoded(observe(name, table, planes, lookahead, *before), planes)
             teacher = None
             if name in teachers:
                 length, share = settings["teacher_iterations"], settings["teacher_random"]
-                teacher = Teacher(kind, teachers[name], length, share)
+                teacher = Teacher(AGENT_KINDS.get(name), teachers[name], length, share)
             seats.append(
                 Seat(
-                    kind, _stock_ppo(name, settings, example, env, cfg, device), planes=planes,
+                    name, _stock_ppo(name, settings, example, env, cfg, device), planes=planes,
                     schedule=settings["schedule"], teacher=teacher,
                 )
             )  # fmt: skip
-        afterstates = None
+        afterstates, bin_returns = None, None
         if lookahead.critic is not None:
             assert isinstance(lookahead.critic, AfterstateCritic), "a run's critic learns"
             afterstates = AfterstateLearner(
                 lookahead.critic, lookahead, cfg["num_steps_per_env"], env.num_envs
             )
+            if isinstance(game, SelectionPacking):
+                bin_returns = BinReturns(cfg["num_steps_per_env"], game.n, game.b, game.device)
         ramp = algorithm["afterstate_ramp"]
-        return PackingPPO(seats, env, lookahead, algorithm["iterations"], afterstates, ramp)
+        return PackingPPO(
+            seats, env, lookahead, algorithm["iterations"], afterstates, ramp, bin_returns
+        )
+
+
+def first_observation(
+    name: str, game: Packing | SelectionPacking, planes: Sequence[str], lookahead: Lookahead,
+    learns: bool,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Return what the agent observes that acts first in a step.
+
+    Args:
+        name: the agent's name.
+        game: the games.
+        planes: extra planes that it observes.
+        lookahead: computes afterstates and their values.
+        learns: whether the agent learns; a frozen agent observes the games by itself.
+    """
+    if name != SELECTION:
+        return observe(name, Step(game, lookahead).table, planes, lookahead)
+    assert isinstance(game, SelectionPacking), "there is something to select"
+    return observe_options(game, lookahead) if learns else {"mask": game.selection_mask}
 
 
 def _encoded(observation: Observation, planes: Sequence[str]) -> TensorDict:
@@ -385,16 +487,18 @@ def _stock_ppo(
     device: str,
 ) -> PPO:
     """Build rsl_rl's PPO with the actor and the critic of one agent."""
-    network = dict(settings["network"])
-    model = {"agent": name, "network": network}
+    actor, critic, named = models_of(name)
+    model = {**named, "network": dict(settings["network"])}
+    on_a_bin = name != SELECTION
+    precision = {"precision": settings["precision"]} if on_a_bin else {}
     agent_cfg = {
         "algorithm": {
             "class_name": PPO,
-            "share_cnn_encoders": True,
+            "share_cnn_encoders": on_a_bin,
             **settings["algorithm"],
         },
-        "actor": {"class_name": Actor, **model, "precision": settings["precision"]},
-        "critic": {"class_name": Critic, **model},
+        "actor": {"class_name": actor, **model, **precision},
+        "critic": {"class_name": critic, **model},
         "obs_groups": {"actor": list(obs.keys()), "critic": list(obs.keys())},
         "num_steps_per_env": cfg["num_steps_per_env"],
         "multi_gpu": cfg["multi_gpu"],

@@ -20,17 +20,19 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 import marl_pack
-from marl_pack.agents.learned import LearnedAgent
+from marl_pack.agents.learned import LearnedAgent, LearnedSelection
 from marl_pack.agents.learning import checkpoint as checkpoints
 from marl_pack.agents.learning.form import check_alike, check_form, check_keys
 from marl_pack.agents.learning.logging import IterationLogger, Progress
-from marl_pack.agents.learning.ppo import PackingPPO
+from marl_pack.agents.learning.ppo import PackingPPO, Step
 from marl_pack.agents.learning.resuming import check_generator, check_progress, checked_optimizer
-from marl_pack.agents.networks.kinds import AGENT_KINDS, Choice
+from marl_pack.agents.networks.actor_critic import shape_of
+from marl_pack.agents.networks.kinds import AGENT_KINDS, SELECTION
 from marl_pack.agents.networks.shape import Network
 from marl_pack.agents.networks.trunk import widen
-from marl_pack.agents.policy import Placement, Policy
+from marl_pack.agents.policy import Policy
 from marl_pack.game.packing import Packing
+from marl_pack.game.selection import SelectionPacking
 from marl_pack.vec_env import PackingVecEnv
 
 COMPARABLE = ("seed", "episodes")  # evaluations that agree in these play the same sequences
@@ -195,7 +197,7 @@ class Runner(OnPolicyRunner):
         }
         for seat in self.alg.seats:
             if seat.teacher_at(self.alg.iteration) is not None:  # resuming needs no other file
-                name = seat.kind.name
+                name = seat.name
                 learned[name]["teacher"] = self.cfg["agents"][name]["teacher"]
         return {
             "format": checkpoints.FORMAT,
@@ -259,15 +261,18 @@ class Runner(OnPolicyRunner):
         """
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
+            if name == SELECTION and name not in checkpoint["agents"]:
+                continue  # it was trained without one: the agent keeps its new weights
             if "critic_state_dict" not in agent or "network" not in agent:
                 raise ValueError(f"init: the checkpoint has no {name} agent that has learned")
             try:
                 old = checkpoints.check_weights(agent, name)
             except ValueError as error:
                 raise ValueError(f"init: {error}") from None
-            new = Network(**self.cfg["agents"][name]["network"])
-            more = set(old.planes) <= set(new.planes)
-            needed = asdict(new) | ({"planes": old.planes} if more else {})
+            new = shape_of(name, self.cfg["agents"][name]["network"])
+            needed = asdict(new)
+            if isinstance(old, Network) and isinstance(new, Network):
+                needed |= {"planes": old.planes} if set(old.planes) <= set(new.planes) else {}
             if other := {key: v for key, v in asdict(old).items() if needed[key] != v}:
                 raise ValueError(
                     f"init: the checkpoint's {name} agent has another network: {other}; use "
@@ -275,8 +280,9 @@ class Runner(OnPolicyRunner):
                 )
             for part in ("actor", "critic"):
                 weights = agent[f"{part}_state_dict"]
-                orientations = AGENT_KINDS[name].orientations
-                getattr(ppo, part).load_state_dict(widen(weights, old, new, orientations))
+                if isinstance(old, Network) and isinstance(new, Network):
+                    weights = widen(weights, old, new, AGENT_KINDS[name].orientations)
+                getattr(ppo, part).load_state_dict(weights)
         if "afterstate_critic" in checkpoint and self.alg.afterstates is not None:
             # Otherwise the critic keeps its new weights.
             weights = checkpoint["afterstate_critic"]
@@ -372,7 +378,7 @@ class Runner(OnPolicyRunner):
             record, needed = checkpoints.agent_of(loaded, name), expected["agents"][name]
             parts = [part for part in needed if part != "teacher"]
             check_keys(record, parts, where, also=("teacher",))
-            if checkpoints.check_weights(record, name) != Network(**needed["network"]):
+            if checkpoints.check_weights(record, name) != shape_of(name, needed["network"]):
                 raise ValueError(f"{where}.network: differs from the network in config.{name}")
             optimizer = checked_optimizer(
                 record["optimizer_state_dict"],
@@ -390,20 +396,22 @@ class Runner(OnPolicyRunner):
 
     def get_inference_policy(self, device: str | None = None) -> Policy:
         """Return the current policy; each learner takes its most probable action."""
-        agents = [
-            LearnedAgent(seat.kind.name, seat.ppo.actor, self.alg.lookahead)
-            if seat.ppo is not None
-            else seat.frozen
-            for seat in self.alg.seats
-        ]
+        lookahead = self.alg.lookahead
+        agents: list[Callable[..., Tensor]] = []
+        for seat in self.alg.seats:
+            if seat.ppo is None:
+                assert seat.frozen is not None, "an agent learns or is frozen"
+                agents.append(seat.frozen)
+            elif seat.kind is None:
+                agents.append(LearnedSelection(seat.ppo.actor, lookahead))
+            else:
+                agents.append(LearnedAgent(seat.name, seat.ppo.actor, lookahead))
 
-        def play(game: Packing) -> Placement:
-            choice: Choice = ()
+        def play(game: Packing | SelectionPacking) -> Any:
+            step = Step(game, lookahead)
             for seat, agent in zip(self.alg.seats, agents, strict=True):
-                assert agent is not None, "an agent learns or is frozen"
-                choice = seat.kind.extend(choice, agent(game, *choice), game.floor)
-            orientation, cell = choice
-            return orientation, cell
+                step.add(seat, agent(step.table, *step.choice))
+            return step.actions.unbind(1)
 
         return play
 

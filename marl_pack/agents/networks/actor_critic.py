@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from marl_pack.agents.networks.distribution import MaskedCategorical
 from marl_pack.agents.networks.heads import pooled_head
-from marl_pack.agents.networks.kinds import AGENT_KINDS
-from marl_pack.agents.networks.shape import Network
+from marl_pack.agents.networks.kinds import AGENT_KINDS, SELECTION
+from marl_pack.agents.networks.selection import SelectionActor, SelectionCritic
+from marl_pack.agents.networks.shape import Network, SelectionNetwork
 from marl_pack.agents.networks.sight import Observation
 from marl_pack.agents.networks.trunk import Features, Trunk
 
@@ -93,15 +94,47 @@ class Critic(MLPModel):
         return self._features(obs)
 
 
-def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | str) -> Actor:
-    """Build an actor with new weights, to load a checkpoint into."""
-    return Actor({}, {"actor": []}, "actor", 1, agent=agent, network=network).to(device)
+def shape_of(agent: str, network: Mapping[str, Any]) -> Network | SelectionNetwork:
+    """Return the shape of an agent's network.
+
+    Args:
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_NAMES`.
+        network: the fields of its shape.
+
+    Raises:
+        ValueError, TypeError: if there is no such network.
+    """
+    return SelectionNetwork(**network) if agent == SELECTION else Network(**network)
+
+
+def models_of(agent: str) -> tuple[Any, Any, dict[str, str]]:
+    """Return the classes of an agent's actor and critic, and the arguments that name the agent."""
+    if agent == SELECTION:
+        return SelectionActor, SelectionCritic, {}
+    return Actor, Critic, {"agent": agent}
+
+
+def make_actor(agent: str, network: Mapping[str, Any], device: torch.device | str) -> Any:
+    """Build an actor with new weights, to load a checkpoint into.
+
+    Args:
+        agent: name in :data:`marl_pack.agents.networks.kinds.AGENT_NAMES`.
+        network: the fields of its shape.
+        device: the device of its weights.
+    """
+    actor, _, named = models_of(agent)
+    return actor({}, {"actor": []}, "actor", 1, **named, network=network).to(device)
 
 
 def make_critic(
-    agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Actor
-) -> Critic:
-    """Build a critic with new weights, which uses the features of its actor's trunk."""
-    trunk = actor.cnns
-    critic = Critic({}, {"critic": []}, "critic", 1, agent=agent, network=network, cnns=trunk)
-    return critic.to(device)
+    agent: str, network: Mapping[str, Any], device: torch.device | str, actor: Any
+) -> Any:
+    """Build a critic with new weights.
+
+    Args:
+        agent, network, device: as for :func:`make_actor`.
+        actor: the agent's actor, whose trunk the critic uses if it has one.
+    """
+    _, critic, named = models_of(agent)
+    shared = {"cnns": actor.cnns} if agent != SELECTION else {}
+    return critic({}, {"critic": []}, "critic", 1, **named, network=network, **shared).to(device)

@@ -77,6 +77,10 @@ AGENT_KINDS: dict[str, AgentKind] = {
 ORIENTATION, PLACEMENT, JOINT = AGENT_KINDS
 TWO_AGENTS = (ORIENTATION, PLACEMENT)
 """The two agents that take turns within a step, in order."""
+SELECTION = "selection"
+"""The agent that selects a box and a bin before them (:mod:`.selection`)."""
+AGENT_NAMES = (SELECTION, *AGENT_KINDS)
+"""The names of all agents."""
 
 
 def observe(

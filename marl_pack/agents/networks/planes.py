@@ -126,6 +126,9 @@ ALWAYS_OBSERVED = {
 }
 """The meaning of the tensors that every observation has, by name."""
 
+PREVIEW = ("preview_longest", "preview_middle", "preview_shortest")
+"""The tensors of the plane ``preview``; sides in order mean the same if the bin is mirrored."""
+
 PLANES: dict[str, Plane] = {
     plane.name: plane
     for plane in (
@@ -247,6 +250,23 @@ PLANES: dict[str, Plane] = {
             {"filled": Meaning("0 to 1", "filled share of the bin's volume")},
             lambda orientations: 1,
             lambda observation: [_at_every_cell(observation["filled"], _shape(observation))],
+        ),
+        Plane(
+            "preview",
+            "the sides of the first box of the preview in falling order, as shares of H; 0 without "
+            "a preview",
+            lambda sight: {
+                name: sight.following[:, i : i + 1].float() for i, name in enumerate(PREVIEW)
+            },
+            {
+                name: Meaning("cells", f"{side} side of the first box of the preview; 0 for none")
+                for name, side in zip(PREVIEW, ("longest", "middle", "shortest"), strict=True)
+            },
+            lambda orientations: 3,
+            lambda observation: [
+                _at_every_cell(observation[name] / observation["height"], _shape(observation))
+                for name in PREVIEW
+            ],
         ),
     )
 }

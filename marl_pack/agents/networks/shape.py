@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from marl_pack import renamed
 from marl_pack.agents.networks.planes import PLANES
@@ -16,6 +16,20 @@ DEFAULT_PLANES = (
     "afterstate_value", "grounded",
 )  # fmt: skip
 """The default input planes of a network: with these, agents learn best on RS."""
+
+
+@dataclass
+class SelectionNetwork:
+    """The shape of the selection agent's network.
+
+    Args:
+        hidden: units of each hidden layer.
+    """
+
+    hidden: int = 64
+
+    def __post_init__(self) -> None:
+        _check_sizes(self)
 
 
 @dataclass
@@ -41,9 +55,7 @@ class Network:
     hidden: int = 64
 
     def __post_init__(self) -> None:
-        for name, most in MOST.items():
-            value = getattr(self, name)
-            whole_number(value, f"network: {name} = {shown(value)}", 1, most)
+        _check_sizes(self)
         for name in ("residual", "shortcut", "context"):
             truth_value(getattr(self, name), f"network: {name}")
         if not isinstance(self.planes, list | tuple) or not all(
@@ -58,6 +70,14 @@ class Network:
             raise ValueError(
                 f"network: planes {shown(self.planes)}: any of {', '.join(PLANES)}, once{guess}"
             )
+
+
+def _check_sizes(network: Network | SelectionNetwork) -> None:
+    """Refuse a size that is not a whole number from 1 to its limit in :data:`MOST`."""
+    for each in fields(network):
+        if each.name in MOST:
+            value = getattr(network, each.name)
+            whole_number(value, f"network: {each.name} = {shown(value)}", 1, MOST[each.name])
 
 
 Network.__doc__ = (Network.__doc__ or "").replace("{planes}", ", ".join(PLANES))

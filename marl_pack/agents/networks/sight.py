@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from marl_pack import bins as bin_state
@@ -63,6 +64,14 @@ class Sight:
         return resting_heights_and_waste(
             bins.heightmap, sides, bins.height, waste="waste" in self.planes, backend=bins.backend
         )
+
+    @property
+    def following(self) -> Tensor:
+        """Sides of the first box of the preview in falling order, int16 [G, 3]; 0 for none."""
+        sides = self.game.following
+        if sides is None:
+            return torch.zeros_like(self.game.items.sides)
+        return sides.sort(1, descending=True).values
 
     @property
     def utilization(self) -> Tensor:

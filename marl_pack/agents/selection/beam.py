@@ -19,10 +19,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from marl_pack.agents.afterstates.gains import gains
 from marl_pack.agents.afterstates.limits import ILLEGAL
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.selection.beam_settings import BeamSettings
-from marl_pack.agents.selection.policies import SelectionPlacement, gains, split
+from marl_pack.agents.selection.policies import SelectionPlacement, split
 from marl_pack.game.selection import SelectionPacking
 
 TIE = 1e-12

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from marl_pack.agents.afterstates.lookahead import Lookahead
-from marl_pack.agents.heuristics import Heuristic, RandomPlay
+from marl_pack.agents.heuristics import Heuristic, RandomPlay, make_policy
 from marl_pack.agents.policy import Policy
 from marl_pack.agents.search import Planner
 from marl_pack.agents.selection.beam import Beam
@@ -15,8 +17,12 @@ from marl_pack.agents.selection.policies import (
     GreedyValue,
     RandomSelection,
     RankedSelection,
+    SelectAs,
+    SelectFirst,
+    SelectionAgent,
     SelectionPlacement,
     SelectionPolicy,
+    first_option,
 )
 from marl_pack.game.selection import SelectionPacking
 
@@ -38,6 +44,10 @@ def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> S
     Raises:
         ValueError: if the policy cannot play such games, or cannot search.
     """
+    if isinstance(policy, SelectFirst) and search is None:
+        return policy
+    if isinstance(policy, SelectFirst):
+        policy = policy.policy
     if isinstance(policy, Planner):
         raise ValueError("search: games with selection need BeamSettings, not SearchSettings")
     if any(agent.symmetric for agent in _agents(policy)):
@@ -57,6 +67,23 @@ def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> S
     if isinstance(policy, RandomPlay):
         return RandomSelection(policy, policy.generator)
     return OwnSelection(policy)
+
+
+def make_selection_agent(
+    name: str, seed: int | None = 0, device: torch.device | str = "cpu"
+) -> SelectionAgent:
+    """Return the selection agent that a heuristic plays.
+
+    Args:
+        name: one of :data:`marl_pack.agents.keys.SELECTION_AGENTS`.
+        seed, device: as for :func:`marl_pack.agents.heuristics.make_policy`.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    if name == "first":
+        return first_option
+    return SelectAs(selection_policy_of(make_policy(name, seed, device)))
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, overload
 
 import torch
 from torch import Tensor
 
-from marl_pack.agents.afterstates.limits import ILLEGAL
+from marl_pack.agents.afterstates.gains import gains
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import Heuristic
-from marl_pack.agents.policy import Policy, draw
+from marl_pack.agents.policy import Explained, Placement, Policy, Reasons, draw
+from marl_pack.game.packing import Packing
 from marl_pack.game.selection import SelectionPacking
 
 SelectionPlacement = tuple[Tensor, Tensor, Tensor]
@@ -34,6 +36,8 @@ def split(game: SelectionPacking, number: Tensor) -> SelectionPlacement:
 class SelectFirst:
     """A policy in turns: an agent selects the option, another policy places its box.
 
+    It also plays games of one visible box and one bin, in which there is nothing to select.
+
     Args:
         selection_agent: selects the option.
         policy: the policy for one box and one bin, which sees the chosen option.
@@ -42,10 +46,43 @@ class SelectFirst:
     selection_agent: SelectionAgent
     policy: Policy
 
-    def __call__(self, game: SelectionPacking) -> SelectionPlacement:
+    @overload
+    def __call__(self, game: Packing) -> Placement: ...
+
+    @overload
+    def __call__(self, game: SelectionPacking) -> SelectionPlacement: ...
+
+    def __call__(self, game: Packing | SelectionPacking) -> Placement | SelectionPlacement:
         """Return option, orientation and cell of each game, int64 [G] each."""
+        if isinstance(game, Packing):
+            return self.policy(game)
         option = self.selection_agent(game)
         return option, *self.policy(game.view(game.rows(option)))
+
+    def reasons(self, game: Packing, orientation: Tensor) -> Reasons:
+        """Return what the other policy computed (:class:`marl_pack.agents.policy.Explained`)."""
+        policy: Any = self.policy
+        return policy.reasons(game, orientation) if isinstance(policy, Explained) else Reasons()
+
+
+def first_option(game: SelectionPacking) -> Tensor:
+    """Return the first legal option of each game, int64 [G] (:data:`SelectionAgent`)."""
+    return game.selection_mask.int().argmax(1)
+
+
+@dataclass(frozen=True)
+class SelectAs:
+    """The selection agent that takes the option of another policy's placement.
+
+    Args:
+        policy: a policy for games with selection.
+    """
+
+    policy: SelectionPolicy
+
+    def __call__(self, game: SelectionPacking) -> Tensor:
+        """Return the option, int64 [G] (:data:`SelectionAgent`)."""
+        return self.policy(game)[0]
 
 
 @dataclass(frozen=True)
@@ -102,23 +139,3 @@ class GreedyValue:
     def __call__(self, game: SelectionPacking) -> SelectionPlacement:
         """Return option, orientation and cell of each game, int64 [G] each."""
         return split(game, gains(game, self.lookahead).flatten(1).argmax(1))
-
-    @torch.inference_mode()
-    def select(self, game: SelectionPacking) -> Tensor:
-        """Return the option of the best placement, int64 [G] (:data:`SelectionAgent`)."""
-        return self(game)[0]
-
-
-def gains(game: SelectionPacking, lookahead: Lookahead) -> Tensor:
-    """Compute what each placement gains, float32 [G, k · b, 6, W, D].
-
-    The gain is the reward plus the value of the bin after the placement, minus its value before.
-
-    Returns:
-        The gains; :data:`ILLEGAL` where a placement is not legal.
-    """
-    view = game.view()
-    before = lookahead.state_value(game.bins, view)[game.bin_of]
-    values = lookahead.afterstate_value(view) - before[:, None, None, None]
-    values = torch.where(view.mask, values, ILLEGAL)
-    return values.view(game.n, game.options, *values.shape[1:])
