@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -20,7 +20,7 @@ from marl_pack.files import Growing
 from marl_pack.items.generated import no_such_file
 from marl_pack.option_record import given_options
 from marl_pack.options import NEXT_BIN, STOP
-from marl_pack.packer.answers import NoPlace, Placement
+from marl_pack.packer.answers import NoPlace, Placement, Waiting
 from marl_pack.packer.conveyor import Arrival, Refused, of_line, of_orders
 from marl_pack.packer.packed import Packed
 from marl_pack.packer.packer import Packer
@@ -48,6 +48,7 @@ class Feed:
             "catalogue": None if chosen.catalogue is None else str(chosen.catalogue),
             "grid_mm": chosen.grid_mm, "seed": chosen.seed,
             "bins": chosen.bins, "open_next": chosen.no_place == NEXT_BIN,
+            "buffer": chosen.buffer, "preview": chosen.preview, "open_bins": chosen.open_bins,
             "explain": chosen.explain,
         }  # fmt: skip
         if chosen.present is not None:
@@ -63,19 +64,55 @@ class Feed:
             if not (same and saved.present.same(self.packer.present)):
                 raise ValueError(f"--state {chosen.state}: was saved with other options")
             self.packer = saved
-        self.times: list[float] = []  # seconds of each answer
+        self.times: list[float] = []  # seconds of each decision
+        self.lines: dict[int, int] = {}  # the line of each box that was shown
         self.stopped = False
         warm_up(arguments)
 
-    def step(self, arrival: Arrival) -> Placement | NoPlace:
-        """Place a box, or do what the options ask for if it has no place."""
-        start = time.perf_counter()
+    def take(self, arrival: Arrival, line: int = 0) -> Iterator[Waiting | Placement | NoPlace]:
+        """Yield the answers that become possible with a box; each is done when it is yielded.
+
+        With a buffer or a preview the first answer says that the box waits, or why it never has a
+        place.
+
+        Args:
+            arrival: the box.
+            line: its line.
+        """
         box = {"order": arrival.order, **arrival.attributes}
-        answer = self.packer.place(arrival.sides, **box)
+        if self.chosen.buffer == 1 and not self.chosen.preview:
+            yield self._timed(
+                lambda: self.packer.place(arrival.sides, **box),
+                lambda: self.packer.skip(arrival.sides, **box),
+            )
+            return
+        answer = self.packer.show(arrival.sides, **box)
+        if isinstance(answer, Waiting):
+            self.lines[answer.number] = line
+            yield answer
+        else:
+            yield self._timed(lambda: answer, lambda: self.packer.skip(arrival.sides, **box))
+        while not self.stopped and not self.packer.needs_box:
+            yield self._next()
+
+    def rest(self) -> Iterator[Placement | NoPlace]:
+        """Yield the answers for the boxes that still wait; no more boxes come."""
+        while not self.stopped and self.packer.waiting:
+            yield self._next()
+
+    def _next(self) -> Placement | NoPlace:
+        return self._timed(self.packer.place_next, self.packer.skip_next)
+
+    def _timed(
+        self, place: Callable[[], Placement | NoPlace], skip: Callable[[], NoPlace]
+    ) -> Placement | NoPlace:
+        """Place a box, or do what the options ask for if it has no place; keep the time."""
+        start = time.perf_counter()
+        answer = place()
         if not answer:
             self.stopped = self.chosen.no_place == STOP
             if not self.stopped:
-                self.packer.skip(arrival.sides, **box)
+                skip()
         self.times.append(time.perf_counter() - start)
         return answer
 
@@ -91,18 +128,20 @@ def pack_file(feed: Feed, console: Console) -> None:
         task = bar.add_task("boxes", total=len(boxes))
         growing.update(feed.packer.plan)
         for arrival in boxes:
-            feed.step(arrival)
+            for _ in feed.take(arrival):
+                growing.update(feed.packer.plan)
             if feed.stopped:
                 break
-            growing.update(feed.packer.plan)
             bar.advance(task)
+        for _ in feed.rest():
+            growing.update(feed.packer.plan)
 
 
 def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
     """Answer each line of a conveyor before the next one is read.
 
-    The plan and the state are written before the answer, so a program that is killed has forgotten
-    no answer.
+    The plan and the state are written before each answer, so a program that is killed has forgotten
+    no answer, and no box that waits.
 
     Args:
         feed: the packer.
@@ -113,9 +152,8 @@ def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
         The number of lines that were refused.
     """
     refused = 0
-    out, state = feed.chosen.out, feed.chosen.state
-    if out is not None:
-        save_plan(out, feed.packer.plan)
+    if feed.chosen.out is not None:
+        save_plan(feed.chosen.out, feed.packer.plan)
     for number, text in enumerate(lines, 1):
         start = time.perf_counter()
         arrival = of_line(text, number, feed.packer.spec)
@@ -123,20 +161,48 @@ def pack_conveyor(feed: Feed, lines: Iterable[str], output: TextIO) -> int:
             continue
         if isinstance(arrival, Refused):
             refused += 1
-            answer: dict[str, Any] = {"line": number, "error": arrival.reason}
+            _write(output, {"line": number, "error": arrival.reason})
         else:
-            answer = {"line": number, **feed.step(arrival).to_dict()}
-            if out is not None:
-                save_plan(out, feed.packer.plan)
-            if state is not None:
-                feed.packer.save(state)
-            feed.times[-1] = time.perf_counter() - start
-            answer["ms"] = round(1000 * feed.times[-1], 3)
-        output.write(json.dumps(answer) + "\n")
-        output.flush()
+            _answer(feed, feed.take(arrival, number), number, start, output)
         if feed.stopped:
             break
+    _answer(feed, feed.rest(), None, time.perf_counter(), output)
     return refused
+
+
+def _answer(
+    feed: Feed, answers: Iterable[Waiting | Placement | NoPlace], line: int | None, start: float,
+    output: TextIO,
+) -> None:  # fmt: skip
+    """Write answers, each after the plan and the state.
+
+    Args:
+        feed: the packer.
+        answers: what it answers.
+        line: the line that was read; None: the input has ended.
+        start: the time at which the first answer was begun.
+        output: gets the answers. The line of an answer is that of its box; null if an earlier run
+            read it.
+    """
+    out, state = feed.chosen.out, feed.chosen.state
+    for answer in answers:
+        content = answer.to_dict()
+        of_box = line if answer.number is None else feed.lines.get(answer.number)
+        if out is not None:
+            save_plan(out, feed.packer.plan)
+        if state is not None:
+            feed.packer.save(state)
+        if not isinstance(answer, Waiting):
+            feed.times[-1] = time.perf_counter() - start
+            content["ms"] = round(1000 * feed.times[-1], 3)
+        _write(output, {"line": of_box, **content})
+        start = time.perf_counter()
+
+
+def _write(output: TextIO, content: dict[str, Any]) -> None:
+    """Write one answer."""
+    output.write(json.dumps(content) + "\n")
+    output.flush()
 
 
 def save_picture(feed: Feed, console: Console) -> None:

@@ -2,7 +2,8 @@
 
 ``marl-pack pack boxes.csv --bin-mm 1200 800 1500 --out plan.json`` packs a file.
 ``marl-pack pack -`` reads one box a line from standard input, and answers each line before it reads
-the next one.
+the next one. With ``--buffer`` or ``--preview`` it first says that the box waits; the placements
+follow as soon as they can be decided, and those of the last boxes at the end of the input.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ def parser(program: str = PROGRAM) -> Parser:
             "boxes.csv --bin-mm 1200 800 1500 --margin-mm 20 --out plan.json",
             "boxes.csv --policy search --plan budget=200ms --out plan.json",
             "- --bin-mm 1200 800 1500 --out plan.json < boxes.jsonl",
+            "boxes.csv --buffer 5 --open-bins 2 --out plan.json",
         ),
     )  # fmt: skip
     options.add_argument("boxes", metavar="FILE", help=".csv or .json file; - for standard input")
@@ -66,6 +68,9 @@ def parser(program: str = PROGRAM) -> Parser:
         metavar="N",
         help="largest number of bins (default: as many as are needed)",
     )
+    add("--open-bins", type=int, default=1, metavar="B",
+        help="number of bins that are open at once; where no visible box has a place, the fullest "
+             "one is closed (default: 1)")  # fmt: skip
     add("--no-place", choices=NO_PLACE, default=NEXT_BIN,
         help="what to do with a box that has no place in the open bin: open the next one "
              "(default), leave the box out, or stop")  # fmt: skip
@@ -75,6 +80,12 @@ def parser(program: str = PROGRAM) -> Parser:
         metavar="FILE",
         help="a plan of one bin (.json or .csv): boxes that are in the first bin already",
     )
+    add = options.add_argument_group("boxes that are known").add_argument
+    add("--buffer", type=int, default=1, metavar="K",
+        help="number of visible boxes, any of which may be placed next (default: 1)")  # fmt: skip
+    add("--preview", type=int, default=0, metavar="P",
+        help="number of boxes after these that are known, but not placed yet; a search plays them "
+             "(default: 0)")  # fmt: skip
     add_arguments(
         options.add_argument_group("game in millimetres"), ExactSpec, leave_out=("alpha", "beta")
     )

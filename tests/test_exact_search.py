@@ -12,6 +12,7 @@ from marl_pack.exact.bins import ExactBins
 from marl_pack.exact.choice import LINEAR
 from marl_pack.exact.futures import Catalogue, History, Shown
 from marl_pack.exact.goods import Goods, check_goods
+from marl_pack.exact.options import Options
 from marl_pack.exact.packing import ExactPacking
 from marl_pack.exact.policies import HEURISTICS, TUNED, read_weights
 from marl_pack.exact.search import CERTAINTY, FEWEST, Search, _Trial
@@ -52,7 +53,8 @@ def test_a_future_is_played_like_a_game(rule: str) -> None:
         if not len(moves):
             continue
         move = moves[[rng.integers(len(moves))]]
-        volume = _Trial(WEIGHTS, bins, item, move).value(0, kinds, rows)
+        trial = _Trial(WEIGHTS, Options(bins, item), np.zeros(1, np.int64), move)
+        volume = trial.value(0, kinds, rows)
         bins.place(item, move)
         before = bins.utilization[0]
         for row in rows.tolist():
@@ -81,7 +83,8 @@ def test_the_search_takes_the_move_that_is_best_in_its_futures() -> None:
             continue
         chosen = int(search(game)[0])
         generator = np.random.default_rng((seed, 0, 4))
-        trial = _Trial(WEIGHTS, game.bins, game.items, moves)
+        options = Options(game.bins, game.items)
+        trial = _Trial(WEIGHTS, options, np.zeros(len(moves), np.int64), moves)
         values = []
         for _ in range(FEWEST):
             future = Catalogue(kinds).draw(generator, game.items, kinds, 36)

@@ -25,6 +25,7 @@ class Placement:
     # nothing carries the box
     yaw: float = 0.0  # rotation about the vertical, degrees; only if the robot reported it
     problem: str = ""  # why a reported pose breaks the rule; "" if it does not
+    number: int | None = None  # which box it is, if the box was shown: 0 for the first one
 
     placed: Literal[True] = True
 
@@ -32,8 +33,14 @@ class Placement:
         return True
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the placement for JSON; yaw and problem only where a pose was reported."""
+        """Return the placement for JSON.
+
+        It has yaw and problem only where a pose was reported, and a number only if the box was
+        shown.
+        """
         values = asdict(self)
+        if self.number is None:
+            del values["number"]
         if not self.yaw and not self.problem:
             del values["yaw"], values["problem"]
         return {"placed": values.pop("placed"), **values}
@@ -46,6 +53,7 @@ class NoPlace:
     id: str
     code: str  # a key of REASONS
     reason: str  # one sentence
+    number: int | None = None  # which box it is, if the box was shown: 0 for the first one
 
     placed: Literal[False] = False
 
@@ -53,8 +61,23 @@ class NoPlace:
         return False
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the answer for JSON."""
-        return {"placed": False, "id": self.id, "code": self.code, "reason": self.reason}
+        """Return the answer for JSON; it has a number only if the box was shown."""
+        values = {"placed": False, "id": self.id, "code": self.code, "reason": self.reason}
+        return values if self.number is None else {**values, "number": self.number}
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A box that was shown and is not placed yet; it is true in a condition."""
+
+    number: int  # 0 for the first box that was shown
+    id: str  # "" where unknown
+    sides: tuple[float, float, float]  # own sides w, d, h in millimetres
+    order: str  # name of its order; "" for none
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer for JSON: which box waits."""
+        return {"waiting": True, "id": self.id, "number": self.number}
 
 
 REASONS = {

@@ -68,7 +68,34 @@ class Opened:
     """The next bin was opened."""
 
 
-Call = Placed | Reported | Skipped | Opened
+@dataclass(frozen=True)
+class Shown:
+    """A box of the conveyor was shown."""
+
+    item: Goods  # one row
+    order: str = ""
+
+
+@dataclass(frozen=True)
+class PlacedNext:
+    """A visible box was placed by a move."""
+
+    number: int  # of the box, 0 for the first one
+    bin: int
+    move: int
+    explanation: Explanation | None = None
+
+
+@dataclass(frozen=True)
+class SkippedNext:
+    """A visible box without a place was left out."""
+
+    number: int
+    code: str
+    reason: str
+
+
+Call = Placed | Reported | Skipped | Opened | Shown | PlacedNext | SkippedNext
 
 
 def goods_of(sides: Any, attributes: Mapping[str, Any], spec: ExactSpec) -> Goods:
@@ -123,19 +150,33 @@ def _goods(box: Any, spec: ExactSpec) -> Goods:
 
 def to_row(call: Call) -> dict[str, Any]:
     """Return a call for JSON."""
-    if isinstance(call, Placed):
+    if isinstance(call, Placed | PlacedNext):
         orientation, x, y, z = placements(call.move).tolist()
-        why = call.explanation
-        row = {
-            "call": "place", "box": _box(call.item), "bin": call.bin, "orientation": orientation,
-            "units": [x, y, z], "order": call.order,
-        }  # fmt: skip
-        return row if why is None else {**row, "explanation": why.to_dict()}
+        where = {"bin": call.bin, "orientation": orientation, "units": [x, y, z]}
+        why = {} if call.explanation is None else {"explanation": call.explanation.to_dict()}
+        if isinstance(call, PlacedNext):
+            return {"call": "place_next", "number": call.number, **where, **why}
+        return {"call": "place", "box": _box(call.item), **where, "order": call.order, **why}
     if isinstance(call, Reported):
         return {"call": "actual", "pose": [call.pose.x, call.pose.y, call.pose.yaw]}
     if isinstance(call, Skipped):
         return {"call": "skip", "box": _box(call.item), "code": call.code, "reason": call.reason}
+    if isinstance(call, Shown):
+        return {"call": "show", "box": _box(call.item), "order": call.order}
+    if isinstance(call, SkippedNext):
+        return {
+            "call": "skip_next", "number": call.number, "code": call.code, "reason": call.reason
+        }  # fmt: skip
     return {"call": "next_bin"}
+
+
+ROWS = {
+    "place": ("box", "bin", "orientation", "units", "order"), "actual": ("pose",),
+    "skip": ("box", "code", "reason"), "next_bin": (), "show": ("box", "order"),
+    "place_next": ("number", "bin", "orientation", "units"),
+    "skip_next": ("number", "code", "reason"),
+}  # fmt: skip
+"""The keys of each call in a file."""
 
 
 def of_row(row: Any, spec: ExactSpec) -> Call:
@@ -144,34 +185,47 @@ def of_row(row: Any, spec: ExactSpec) -> Call:
     Raises:
         ValueError: if it is not such a row.
     """
-    keys = {
-        "place": ("box", "bin", "orientation", "units", "order"), "actual": ("pose",),
-        "skip": ("box", "code", "reason"), "next_bin": (),
-    }  # fmt: skip
-    if not isinstance(row, dict) or row.get("call") not in list(keys):
-        raise ValueError(f"call {shown(row)}: needs an object whose call is one of {[*keys]}")
-    needed = ("call", *keys[row["call"]])
-    allowed = (*needed, "explanation") if row["call"] == "place" else needed
-    check_names(row, allowed, needed, f"call {row['call']}", "key")
-    if row["call"] == "place":
-        if not isinstance(row["units"], list) or len(row["units"]) != 3:
-            raise ValueError(f"call place: units {shown(row['units'])}: needs x, y, z")
-        x, y, z = (whole_number(v, "call place: units", 0, 10**6) for v in row["units"])
-        orientation = whole_number(row["orientation"], "call place: orientation", 0, 5)
-        bin = whole_number(row["bin"], "call place: bin", 0)
-        if not isinstance(row["order"], str):
-            raise ValueError(f"call place: order {shown(row['order'])}: needs a text")
-        item, why = _goods(row["box"], spec), row.get("explanation")
-        explanation = None if why is None else Explanation.of_dict(why, "call place: explanation")
-        move = int(encode(orientation, x, y, z))
-        return Placed(item, bin, move, row["order"], explanation)
-    if row["call"] == "actual":
+    if not isinstance(row, dict) or row.get("call") not in list(ROWS):
+        raise ValueError(f"call {shown(row)}: needs an object whose call is one of {[*ROWS]}")
+    name = row["call"]
+    needed = ("call", *ROWS[name])
+    allowed = (*needed, "explanation") if name in ("place", "place_next") else needed
+    check_names(row, allowed, needed, f"call {name}", "key")
+    if "order" in row and not isinstance(row["order"], str):
+        raise ValueError(f"call {name}: order {shown(row['order'])}: needs a text")
+    if "code" in row and (row["code"] not in list(REASONS) or not isinstance(row["reason"], str)):
+        raise ValueError(f"call {name}: needs one of the codes {', '.join(REASONS)}, and a text")
+    number = whole_number(row["number"], f"call {name}: number", 0) if "number" in row else 0
+    if name == "place":
+        return Placed(_goods(row["box"], spec), *_where(row), row["order"], _why(row))
+    if name == "place_next":
+        return PlacedNext(number, *_where(row), _why(row))
+    if name == "actual":
         return Reported(Pose.of(row["pose"]))
-    if row["call"] == "skip":
-        if row["code"] not in list(REASONS) or not isinstance(row["reason"], str):
-            raise ValueError(f"call skip: needs one of the codes {', '.join(REASONS)}, and a text")
+    if name == "skip":
         return Skipped(_goods(row["box"], spec), row["code"], row["reason"])
+    if name == "show":
+        return Shown(_goods(row["box"], spec), row["order"])
+    if name == "skip_next":
+        return SkippedNext(number, row["code"], row["reason"])
     return Opened()
+
+
+def _where(row: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the bin and the move in the row of a placement."""
+    source = f"call {row['call']}"
+    if not isinstance(row["units"], list) or len(row["units"]) != 3:
+        raise ValueError(f"{source}: units {shown(row['units'])}: needs x, y, z")
+    x, y, z = (whole_number(v, f"{source}: units", 0, 10**6) for v in row["units"])
+    orientation = whole_number(row["orientation"], f"{source}: orientation", 0, 5)
+    bin = whole_number(row["bin"], f"{source}: bin", 0)
+    return bin, int(encode(orientation, x, y, z))
+
+
+def _why(row: Mapping[str, Any]) -> Explanation | None:
+    """Return the explanation in the row of a placement, if there is one."""
+    source = f"call {row['call']}: explanation"
+    return Explanation.of_dict(row["explanation"], source) if "explanation" in row else None
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -226,7 +280,8 @@ def read(content: Any) -> tuple[dict[str, Any], list[Any]]:
     ):  # fmt: skip
         if not isinstance(content[key], kind):
             raise ValueError(f"{key}: needs {'a list' if kind is list else 'an object'}")
-    names = ("policy", "bins", "open_next", "plan", "catalogue", "grid_mm", "seed", "explain")
+    names = ("policy", "bins", "open_next", "buffer", "preview", "open_bins", "plan", "catalogue",
+             "grid_mm", "seed", "explain")  # fmt: skip
     check_names(content["arguments"], names, (), "arguments", "key")
     made = {"spec": ExactSpec.of(content["options"]), **content["arguments"]}
     if content["present"]:

@@ -128,26 +128,30 @@ class CellAgent:
         self._contact = HEURISTICS["max_contact"]().weights
 
     def __call__(self, turn: Turn) -> NDArray[np.int64]:
-        """Return the move of the visible box, int64 [1]; NOWHERE if it has no place."""
-        numbers = turn.moves.of(0)
+        """Return the move of each option, int64 [G]; NOWHERE where its box has no place."""
+        return np.array([self._move(turn, g) for g in range(len(turn.pairs))])
+
+    def _move(self, turn: Turn, g: int) -> int:
+        """Return the move of option ``g``."""
+        numbers = turn.moves.of(g)
         if not len(numbers):
-            return np.array([NOWHERE])
+            return NOWHERE
         with torch.inference_mode():
-            moves = self._choose(turn, numbers)
+            moves = self._choose(turn, g, numbers)
         bins = turn.bins
-        return np.array([
-            best_of(
-                LINEAR, self._contact, bins.limits, bins.size, bins.state.boxes[0],
-                int(bins.state.count[0]), turn.items.sides[0], moves,
-            )
-        ])  # fmt: skip
+        return best_of(
+            LINEAR, self._contact, bins.limits, bins.size, bins.state.boxes[g],
+            int(bins.state.count[g]), turn.items.sides[g], moves,
+        )  # fmt: skip
 
     def reasons(self, turn: Turn, g: int, moves: NDArray[np.int64], move: int) -> Reasons:
-        """Return what the agents computed in the last call.
+        """Return what the agents computed for option ``g`` in the last call.
 
         Moves that the grid shows at the same cell have the same probability and value
         (:class:`marl_pack.exact.explaining.Explained`).
         """
+        if len(turn.pairs) > 1:  # the game on the grid shows the last option
+            self._move(turn, g)
         cells, orientations = self._cells, placements(moves)[:, 0]
         if not (cells >= 0).any() or not isinstance(self.policy, Explained):
             return Reasons()
@@ -165,15 +169,15 @@ class CellAgent:
             values = np.where(cells >= 0, of_cells[orientations, cells], np.nan)
         return Reasons(values, own.value_of, first, probabilities, probability_of=PROBABILITY_OF[1])
 
-    def _choose(self, turn: Turn, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Show the agents the turn on the grid, and return the moves at the cell they choose.
+    def _choose(self, turn: Turn, g: int, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Show the agents option ``g`` on the grid, and return the moves at the cell they choose.
 
         Moves that the grid cannot show, because the box would reach above the bin there, are left
         out; if there are no others, all moves are returned.
         """
         game = self.game
         where = placements(numbers)
-        sides = self._show(turn.bins, turn.items.sides[0], np.unique(where[:, 0]))
+        sides = self._show(turn.bins, g, turn.items.sides[g], np.unique(where[:, 0]))
         cells = self._cells = self._cells_of(where, sides)
         shown = cells >= 0
         if not shown.any():
@@ -189,12 +193,12 @@ class CellAgent:
         return numbers[(where[:, 0] == int(orientation)) & (cells == int(cell))]
 
     def _show(
-        self, bins: ExactBins, sides: NDArray[np.int64], legal: NDArray[np.int64]
+        self, bins: ExactBins, b: int, sides: NDArray[np.int64], legal: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Write the bin and the visible box, rounded up to cells, into the game of the agents.
+        """Write a bin and the visible box, rounded up to cells, into the game of the agents.
 
         Args:
-            bins: the bin.
+            bins, b: the bins, and the number of the one to show.
             sides: int64 [3], the box's own sides in units.
             legal: the orientations that have a move.
 
@@ -203,7 +207,7 @@ class CellAgent:
         """
         game, state = self.game, self.game.state
         heights, empty = np.zeros(game.size[:2], np.int16), np.zeros(game.size[:2], np.int16)
-        filled = rasterize(bins.state.boxes[0], int(bins.state.count[0]), self.cell, heights, empty)
+        filled = rasterize(bins.state.boxes[b], int(bins.state.count[b]), self.cell, heights, empty)
         state.bins.heightmap[0] = torch.from_numpy(np.minimum(heights, game.size[2]))
         state.bins.empty_map[0] = torch.from_numpy(np.minimum(empty, game.size[2]))
         state.bins.filled[0] = min(filled, game.volume)

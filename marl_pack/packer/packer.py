@@ -3,67 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from marl_pack.checks import LARGEST_SEED, shown, truth_value, whole_number
-from marl_pack.exact.bins import ExactBins, placements
+from marl_pack.exact.bins import ExactBins
 from marl_pack.exact.explaining import explain
-from marl_pack.exact.goods import AXES, Goods, ThinError, fitting, joined
+from marl_pack.exact.goods import Goods, fitting
 from marl_pack.exact.lengths import to_mm
-from marl_pack.exact.present import Present, check_present
+from marl_pack.exact.present import check_present
 from marl_pack.exact.spec import ExactSpec
-from marl_pack.exact.support import Support, measure
 from marl_pack.explanation import Explanation
-from marl_pack.files import write_json
-from marl_pack.inputs import read_json
 from marl_pack.option_record import document
 from marl_pack.packer import calls
-from marl_pack.packer.answers import NoPlace, Placement
-from marl_pack.packer.calls import Call, Opened, Placed, Reported, Skipped
-from marl_pack.packer.packed import Packed, row_at
+from marl_pack.packer.answers import NoPlace, Placement, Waiting
+from marl_pack.packer.calls import (
+    Call,
+    Opened,
+    Placed,
+    PlacedNext,
+    Reported,
+    Shown,
+    Skipped,
+    SkippedNext,
+)
+from marl_pack.packer.choosing import (
+    Known,
+    able_or_refused,
+    check_order,
+    decide,
+    refused_by_empty_bin,
+)
+from marl_pack.packer.journal import Journal
+from marl_pack.packer.open_bins import OpenBins, row_of
+from marl_pack.packer.packed import Packed
 from marl_pack.packer.policies import PackerPolicy, make_packer_policy
 from marl_pack.packer.poses import Pose
 from marl_pack.packer.reasons import why_not
-from marl_pack.packer.turn import Turn
+from marl_pack.packer.report import PackerState, plan_of, state_of
 from marl_pack.plan import LeftOut, Plan
 
 MOST_BINS = 1_000_000
+MOST_VISIBLE, MOST_OPEN = 64, 16
+"""Most boxes in a buffer and in a preview, and open bins."""
 
 
 @dataclass(frozen=True)
 class _Offer:
     """What would be done with a box."""
 
-    given: Goods  # one row
-    order: str
-    item: Goods  # the box with the orientations in which it fits
+    known: Known
     answer: Placement | NoPlace
     move: int = -1
     explanation: Explanation | None = None
-
-
-@dataclass(frozen=True)
-class PackerState:
-    """What the packer has done so far."""
-
-    bins: int  # number of bins opened, the open one included
-    boxes: tuple[int, ...]  # number of boxes in each bin
-    utilization: tuple[float, ...]  # share of each bin's volume that is filled
-    weight: tuple[float, ...]  # known weights in each bin, kilograms
-    left_out: tuple[LeftOut, ...]  # boxes that were skipped
-    least_margin: float | None  # smallest margin of a box that rests on others, mm
+    given: Goods | None = None  # as ``place`` got it; None: a box that was shown
 
 
 @document(ExactSpec, " " * 8)
-class Packer:
+class Packer(Journal):
     """Pack boxes as they come: boxes in, poses out, in millimetres.
 
-    One bin is open. A box gets the place that the policy chooses among those that the rule allows.
+    A box gets the place that the policy chooses among those that the rule allows. By default one
+    bin is open, and :meth:`place` gives each box its place. With a buffer or a preview,
+    :meth:`show` tells of the boxes that come, and :meth:`place_next` places one of them.
 
     Attributes:
         spec: the options of the bins and of the rule.
@@ -78,7 +81,11 @@ class Packer:
             or a function (:class:`marl_pack.exact.policies.ExactPolicy`).
         spec: the options; by default ``ExactSpec()``.
         bins: largest number of bins, one by default; None for any number.
-        open_next: whether the next bin is opened when a box has no place in the open one.
+        open_next: whether the fullest open bin is closed and the next one is opened when no visible
+            box has a place in an open bin.
+        buffer: number of visible boxes k, any of which may be placed next.
+        preview: number of boxes p after the visible ones that are known, but not placed yet.
+        open_bins: number of bins b that are open at once.
         present: boxes that are in the first bin already
             (:func:`marl_pack.exact.present.check_present`).
         plan: settings of the policy ``search``, such as ``"budget=500ms"``.
@@ -103,6 +110,9 @@ class Packer:
         spec: ExactSpec | None = None,
         bins: int | None = 1,
         open_next: bool = True,
+        buffer: int = 1,
+        preview: int = 0,
+        open_bins: int = 1,
         present: Any = (),
         plan: Any = None,
         catalogue: Any = None,
@@ -117,10 +127,19 @@ class Packer:
         self.spec = (spec or ExactSpec()).with_options({**options, **size})
         self.most_bins = None if bins is None else whole_number(bins, "bins", 1, MOST_BINS)
         self.open_next = truth_value(open_next, "open_next")
+        self.buffer = whole_number(buffer, "buffer", 1, MOST_VISIBLE)
+        self.preview = whole_number(preview, "preview", 0, MOST_VISIBLE)
+        self.open_bins = whole_number(open_bins, "open_bins", 1, MOST_OPEN)
+        if self.most_bins is not None and self.open_bins > self.most_bins:
+            raise ValueError(
+                f"open_bins = {self.open_bins}: needs at least as many bins, not bins = "
+                f"{self.most_bins} (None allows any number)"
+            )
         seed = whole_number(seed, "seed", 0, LARGEST_SEED)
         self.arguments = {
-            "policy": policy, "bins": self.most_bins, "open_next": open_next, "plan": plan,
-            "catalogue": catalogue, "grid_mm": grid_mm, "seed": seed,
+            "policy": policy, "bins": self.most_bins, "open_next": open_next,
+            "buffer": self.buffer, "preview": self.preview, "open_bins": self.open_bins,
+            "plan": plan, "catalogue": catalogue, "grid_mm": grid_mm, "seed": seed,
             "explain": truth_value(explain, "explain"),
         }  # fmt: skip
         self.present = check_present(present, self.spec)
@@ -130,30 +149,28 @@ class Packer:
         self.calls: list[Call] = []
         self._begin()
 
-    bin: ExactBins  # the open one
-
     def _begin(self) -> None:
-        """Open the first bin, with the boxes that are there already."""
-        self.packed: list[list[Packed]] = []
-        self.orders: list[str] = []
+        """Open the first bins; boxes that are there already are in the first one."""
+        self._bins = OpenBins(self.spec, self.open_bins, self.most_bins, self.present)
         self.left_out: list[LeftOut] = []
-        self._shown: list[Goods] = []
+        self._shown: list[Goods] = []  # all boxes, by their numbers
+        self._known: list[Known] = []  # those that are not placed yet, in the order of the conveyor
         self._offered: _Offer | None = None
-        self._closed_weights: list[float] = []
-        self._open_bin(self.present)
 
-    def _open_bin(self, present: Present | None = None) -> None:
-        """Open the next bin."""
-        if self.packed:
-            self._closed_weights.append(float(self.bin.weight[0]))
-        self.bin = ExactBins(1, self.spec)
-        self.packed.append([])
-        self.orders.append("")
-        if present is None:
-            return
-        for k in range(len(present.rows)):
-            item, row = present.goods[[k]], _whole(present.rows[k])
-            self._add(item, row, self._answer(item, row, -1, self._support(item, row)))
+    @property
+    def bin(self) -> ExactBins:
+        """The open bin that was opened last."""
+        return self._bins.last
+
+    @property
+    def orders(self) -> list[str]:
+        """The order that each bin belongs to; "" for none."""
+        return self._bins.orders
+
+    @property
+    def packed(self) -> list[list[Packed]]:
+        """The boxes in each bin."""
+        return [self._bins.in_bin(k) for k in range(len(self._bins))]
 
     # --- boxes ------------------------------------------------------------------------------------
 
@@ -166,7 +183,7 @@ class Packer:
             sides: the box's own sides w, d, h in millimetres.
             order, attributes: as for :meth:`place`.
         """
-        return self._offer(self._goods(sides, attributes), order).answer
+        return self._offer("offer", sides, order, attributes).answer
 
     def place(
         self, sides: Sequence[float], *, order: str = "", **attributes: Any
@@ -186,15 +203,104 @@ class Packer:
             nothing has changed.
 
         Raises:
-            ValueError: if a side or an attribute is impossible; says what would be right.
+            ValueError: if a side or an attribute is impossible, or there is a buffer or a preview;
+                says what would be right.
         """
-        offer = self._offer(self._goods(sides, attributes), order)
+        offer = self._offer("place", sides, order, attributes)
         if isinstance(offer.answer, Placement):
-            self._do(Placed(offer.item, offer.answer.bin, offer.move, order, offer.explanation))
+            item = offer.known.item
+            self._do(Placed(item, offer.answer.bin, offer.move, order, offer.explanation))
+        return offer.answer
+
+    @property
+    def needs_box(self) -> bool:
+        """Whether more boxes should be shown before the next decision: fewer than k + p are known.
+
+        Where the conveyor brings no more boxes, :meth:`place_next` places the rest without them.
+        """
+        return len(self._known) < self.buffer + self.preview
+
+    @property
+    def waiting(self) -> tuple[Waiting, ...]:
+        """The boxes that were shown and are not placed yet: the k visible ones, then the others."""
+        return tuple(known.waiting(self.spec.unit_mm) for known in self._known)
+
+    def show(
+        self, sides: Sequence[float], *, order: str = "", **attributes: Any
+    ) -> Waiting | NoPlace:
+        """Tell of the next box of the conveyor.
+
+        Args:
+            sides, order, attributes: the box, as for :meth:`place`.
+
+        Returns:
+            The box with its number, 0 for the first one; or
+            :class:`marl_pack.packer.answers.NoPlace` if it has no place in an empty bin, and then
+            nothing has changed: :meth:`skip` records it.
+
+        Raises:
+            ValueError: if k + p boxes are known, or the box is impossible.
+        """
+        if not self.needs_box:
+            raise ValueError(
+                f"show: {len(self._known)} boxes are known, as many as may be (buffer + preview); "
+                "place_next places one"
+            )
+        item, order = calls.goods_of(sides, attributes, self.spec), check_order(order)
+        able, refusal = refused_by_empty_bin(item, self.spec)
+        if refusal is not None:
+            return refusal
+        self._do(Shown(able, order))
+        return self.waiting[-1]
+
+    def offer_next(self) -> Placement | NoPlace:
+        """Return what :meth:`place_next` would do; nothing changes.
+
+        Raises:
+            ValueError: if no box is known.
+        """
+        return self._offer_next("offer_next").answer
+
+    def place_next(self) -> Placement | NoPlace:
+        """Choose one of the visible boxes and place it; the next known box becomes visible.
+
+        Where none has a place in an open bin, the fullest open bin is closed and replaced by a new
+        one, as far as ``bins`` and ``open_next`` allow it.
+
+        Returns:
+            The placement, whose ``number`` says which box it is; or
+            :class:`marl_pack.packer.answers.NoPlace` if no visible box has a place, with the reason
+            for the one that was shown first. Then nothing has changed: :meth:`skip_next` leaves it
+            out.
+
+        Raises:
+            ValueError: if no box is known.
+        """
+        offer = self._offer_next("place_next")
+        if isinstance(offer.answer, Placement):
+            number = offer.known.number
+            assert number is not None
+            self._do(PlacedNext(number, offer.answer.bin, offer.move, offer.explanation))
+        return offer.answer
+
+    def skip_next(self) -> NoPlace:
+        """Leave out the visible box that was shown first, and record why; the plan lists it.
+
+        Raises:
+            ValueError: if a visible box has a place, or no box is known.
+        """
+        offer = self._offer_next("skip_next")
+        if isinstance(offer.answer, Placement):
+            raise ValueError("skip_next: a visible box has a place; place_next places it")
+        number = offer.known.number
+        assert number is not None
+        self._do(SkippedNext(number, offer.answer.code, offer.answer.reason))
         return offer.answer
 
     def skip(self, sides: Sequence[float], *, order: str = "", **attributes: Any) -> NoPlace:
         """Leave out a box that has no place, and record why; the plan lists it.
+
+        With a buffer or a preview this is for boxes that :meth:`show` refuses.
 
         Args:
             sides, order, attributes: the box, as for :meth:`place`.
@@ -202,20 +308,28 @@ class Packer:
         Raises:
             ValueError: if the box has a place, or is impossible.
         """
-        offer = self._offer(self._goods(sides, attributes), order)
-        if isinstance(offer.answer, Placement):
-            raise ValueError("skip: the box has a place; place it")
-        self._do(Skipped(offer.item, offer.answer.code, offer.answer.reason))
-        return offer.answer
+        if self._selects:
+            item = calls.goods_of(sides, attributes, self.spec)
+            check_order(order)
+            able, answer = refused_by_empty_bin(item, self.spec)
+            if answer is None:
+                raise ValueError("skip: the box has a place in an empty bin; show it")
+        else:
+            offer = self._offer("skip", sides, order, attributes)
+            if isinstance(offer.answer, Placement):
+                raise ValueError("skip: the box has a place; place it")
+            able, answer = offer.known.item, offer.answer
+        self._do(Skipped(able, answer.code, answer.reason))
+        return answer
 
     def next_bin(self) -> int:
-        """Close the open bin and open the next one; return its number.
+        """Close the fullest open bin and open the next one; return its number.
 
         Raises:
-            ValueError: if the open bin is empty, or no more bins may be opened.
+            ValueError: if the open bins are empty, or no more bins may be opened.
         """
         self._do(Opened())
-        return len(self.packed) - 1
+        return len(self._bins) - 1
 
     def actual(self, pose: Pose | Sequence[float]) -> Placement:
         """Report where the robot really put the box that was placed last.
@@ -231,130 +345,30 @@ class Packer:
             The placement as it is.
 
         Raises:
-            ValueError: if no box was placed in the open bin, or one cannot be there: it would
+            ValueError: if no box was placed, its bin is closed, or it cannot be there: it would
                 overlap another box or reach out of the bin.
         """
         self._do(Reported(Pose.of(pose)))
-        return self.packed[-1][-1].placement
-
-    def undo(self) -> None:
-        """Undo the last call of ``place``, ``skip``, ``next_bin`` or ``actual``.
-
-        Raises:
-            ValueError: if there is none.
-        """
-        if not self.calls:
-            raise ValueError("undo: nothing was done yet")
-        self.replay(self.calls[:-1])
-
-    def replay(self, done: Sequence[Call]) -> None:
-        """Begin again and do calls, each of which is checked; if that fails, nothing changes.
-
-        Args:
-            done: calls that a packer with the same arguments recorded (:attr:`calls`).
-
-        Raises:
-            ValueError: if a call is impossible.
-        """
-        before = dict(vars(self))
-        try:
-            self._begin()
-            for call in done:
-                self._apply(call)
-            self.calls = list(done)
-        except ValueError:
-            vars(self).update(before)
-            raise
+        return self._bins.boxes[-1].placement
 
     # --- what was done ----------------------------------------------------------------------------
 
     @property
     def placements(self) -> tuple[Placement, ...]:
         """The placements so far, in order; boxes that were there already come first."""
-        return tuple(packed.placement for bin in self.packed for packed in bin)
+        return tuple(box.placement for box in self._bins.boxes)
 
     @property
     def state(self) -> PackerState:
         """What the packer has done so far."""
-        volume = self.bin.volume
-        margins = [p.margin for p in self.placements if p.z > 0 and p.margin is not None]
-        return PackerState(
-            len(self.packed),
-            tuple(len(bin) for bin in self.packed),
-            tuple(
-                float(sum(float(box.item.volumes[0]) for box in bin) / volume)
-                for bin in self.packed
-            ),
-            (*self._closed_weights, float(self.bin.weight[0])),
-            tuple(self.left_out),
-            min(margins, default=None),
-        )
+        return state_of(self._bins, self.left_out, self.waiting)
 
     @property
     def plan(self) -> Plan:
         """All boxes placed so far, in millimetres, and those that were left out."""
-        boxes = [packed for bin in self.packed for packed in bin]
-        placed = [box.placement for box in boxes]
-        items = joined([box.item for box in boxes], self.spec.unit_mm)
-        weights, known = self.bin.weights_of(items)
-        rows = np.array([(p.x, p.y, p.z, p.w, p.d, p.h) for p in placed]).reshape(-1, 6)
-        if (rows == np.round(rows)).all() and _whole_numbers(self.spec.bin_mm):
-            rows = rows.astype(np.int64)
-        size = np.array(self.spec.bin_mm)
-        return Plan(
-            np.tile(size.astype(rows.dtype), (len(self.packed), 1)),
-            np.array([p.bin for p in placed], np.int64), rows[:, :3], rows[:, 3:],
-            np.array([p.orientation for p in placed], np.int64), weights,
-            np.array([p.centre[:2] for p in placed]).reshape(-1, 2),
-            tuple(p.id for p in placed), 1.0,
-            yaws=np.array([p.yaw for p in placed]),
-            weights_assumed=~known,
-            stackable=items.stackable, max_loads=items.max_load,
-            supports=np.array([p.support for p in placed]),
-            margins=np.array([np.nan if p.margin is None else p.margin for p in placed]),
-            left_out=tuple(self.left_out),
-            orders=tuple(self.orders) if any(self.orders) else (),
-            explanations=tuple(box.explanation for box in boxes if self.arguments["explain"]),
-        )  # fmt: skip
-
-    def save(self, path: str | Path) -> None:
-        """Write everything that :meth:`restore` needs to a JSON file.
-
-        A function as the policy, and a catalogue that is not a file, are not saved: they have to be
-        given to :meth:`restore`.
-        """
-        content = calls.to_dict(self.spec, self.arguments, self.present, self.calls)
-        write_json(Path(path), content)
-
-    @classmethod
-    def restore(cls, path: str | Path, **arguments: Any) -> Packer:
-        """Return the packer that :meth:`save` wrote.
-
-        The calls are done again and every placement is checked, so the file need not be trusted.
-
-        Args:
-            path: the file.
-            **arguments: arguments of the packer that replace those in the file, such as ``policy``.
-
-        Raises:
-            ValueError: if the file is not such a file, or a call in it is impossible.
-        """
-        content = read_json(Path(path))
-        try:
-            made, rows = calls.read(content)
-            packer = cls(**calls.complete(made, arguments))
-            packer.replay([calls.of_row(row, packer.spec) for row in rows])
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-        return packer
+        return plan_of(self._bins, self.left_out, bool(self.arguments["explain"]))
 
     # --- calls ------------------------------------------------------------------------------------
-
-    def _do(self, call: Call) -> None:
-        """Do a call and record it; if it is impossible, nothing changes."""
-        self._apply(call)
-        self._offered = None
-        self.calls.append(call)
 
     def _apply(self, call: Call) -> None:
         """Change the bins by a call.
@@ -363,186 +377,129 @@ class Packer:
             ValueError: if it is impossible.
         """
         if isinstance(call, Placed):
-            self._apply_placed(call)
+            item = self._fitting(call.item)
+            self._bins.place(item, call.order, call.bin, call.move, None, call.explanation)
+            self._shown.append(item)
         elif isinstance(call, Reported):
-            self._apply_reported(call.pose)
+            self._bins.move_last(call.pose)
         elif isinstance(call, Skipped):
-            sides = to_mm(call.item.sides[0], self.spec.unit_mm).tolist()
+            self._leave_out(call.item, call.reason)
             self._shown.append(call.item)
-            name = str(call.item.ids[0])
-            self.left_out.append(LeftOut(name, (sides[0], sides[1], sides[2]), call.reason))
+        elif isinstance(call, Shown):
+            if not self.needs_box:
+                raise ValueError("show: more boxes are known than buffer + preview")
+            self._known.append(Known(self._fitting(call.item), call.order, len(self._shown)))
+            self._shown.append(call.item)
+        elif isinstance(call, PlacedNext):
+            box = self._visible(call.number)
+            self._bins.place(
+                box.item, box.order, call.bin, call.move, call.number, call.explanation
+            )
+            self._known.remove(box)
+        elif isinstance(call, SkippedNext):
+            box = self._visible(call.number)
+            self._leave_out(box.item, call.reason)
+            self._known.remove(box)
         else:
-            self._check_next()
-            self._open_bin()
+            self._bins.open_next()
+        self._offered = None
 
-    def _apply_placed(self, call: Placed) -> None:
-        """Place a box in the open bin, or in the next one."""
-        opens = call.bin == len(self.packed)
-        wrong = ValueError(f"box {str(call.item.ids[0])!r}: its placement is not legal")
-        if opens:
-            self._check_next()
-        elif call.bin != len(self.packed) - 1 or not self._fits_order(call.order):
-            raise wrong
-        item = fitting(call.item, self.spec, to_mm(call.item.sides, self.spec.unit_mm), "box")
-        bin = ExactBins(1, self.spec) if opens else self.bin
-        if not bin.legal(item, np.array([call.move]))[0]:
-            raise wrong
-        if opens:
-            self._open_bin()
-        self.orders[-1] = call.order
-        row = _row_of(item, call.move)
-        answer = self._answer(item, row, call.move & 7, self._support(item, row))
-        self._shown.append(item)
-        self._add(item, row, answer, explanation=call.explanation)
+    def _leave_out(self, item: Goods, reason: str) -> None:
+        """Record a box without a place."""
+        w, d, h = to_mm(item.sides[0], self.spec.unit_mm).tolist()
+        self.left_out.append(LeftOut(str(item.ids[0]), (w, d, h), reason))
 
-    def _check_next(self) -> None:
-        """Refuse to open the next bin if the open one is empty, or all bins are used.
+    def _visible(self, number: int) -> Known:
+        """Return a visible box.
 
         Raises:
-            ValueError: saying which.
+            ValueError: if no visible box has the number.
         """
-        if not self.packed[-1]:
-            raise ValueError("next_bin: the open bin is empty")
-        if self.most_bins is not None and len(self.packed) >= self.most_bins:
-            raise ValueError(
-                f"next_bin: all {self.most_bins} bins are open or closed (bins = "
-                f"{self.most_bins}; None allows any number)"
-            )
-
-    def _fits_order(self, order: str) -> bool:
-        """Return whether a box of an order may be placed in the open bin."""
-        begun = len(self.packed[-1]) > (len(self.present.rows) if len(self.packed) == 1 else 0)
-        return not begun or self.orders[-1] == order
-
-    def _add(
-        self, item: Goods, row: NDArray[np.int64], answer: Placement,
-        planned: Placement | None = None, explanation: Explanation | None = None,
-    ) -> None:  # fmt: skip
-        """Add a box at a row to the open bin."""
-        self.bin.add(row[None], item, np.ones(1, np.bool_))
-        unit = self.spec.unit_mm
-        middle = answer.centre[0] / unit, answer.centre[1] / unit
-        self.packed[-1].append(Packed(item, answer, planned or answer, row, middle, explanation))
-
-    def _apply_reported(self, pose: Pose) -> None:
-        """Move the last box of the open bin to the pose that a robot reported."""
-        unit = self.spec.unit_mm
-        if len(self.packed[-1]) <= (len(self.present.rows) if len(self.packed) == 1 else 0):
-            raise ValueError("actual: no box was placed in the open bin")
-        *others, last = self.packed[-1]
-        planned = last.planned
-        row = row_at(pose, planned, others, self.bin.size, unit)
-        without = ExactBins(1, self.spec)
-        for box in others:
-            without.add(box.row[None], box.item, np.ones(1, np.bool_))
-        weight = float(without.weights_of(last.item)[0][0])
-        support = measure(without, row, weight, without.blocked(0, last.item))
-        z = float(to_mm(row[2], unit))
-        answer = Placement(
-            planned.id, planned.bin, planned.orientation, pose.x - planned.w / 2,
-            pose.y - planned.d / 2, z, planned.w, planned.d, planned.h,
-            (pose.x, pose.y, z + planned.h / 2), support.share, _margin(support, unit), pose.yaw,
-            "" if support.stands else f"it does not stand there by the rule {self.spec.rule}",
-        )  # fmt: skip
-        self.bin = without
-        self.packed[-1] = others
-        self._add(last.item, row, answer, planned, last.explanation)
+        for known in self._known[: self.buffer]:
+            if known.number == number:
+                return known
+        raise ValueError(f"box {number}: is not visible")
 
     # --- offers -----------------------------------------------------------------------------------
 
-    def _goods(self, sides: Sequence[float], attributes: Mapping[str, Any]) -> Goods:
-        """Return a box as one row of goods; refuse impossible values."""
-        return calls.goods_of(sides, attributes, self.spec)
+    @property
+    def _selects(self) -> bool:
+        """Whether boxes have to be shown before they are placed."""
+        return self.buffer + self.preview > 1 or bool(self._known)
 
-    def _offer(self, item: Goods, order: str) -> _Offer:
+    def _fitting(self, item: Goods) -> Goods:
+        """Return a box with the orientations in which it fits into an empty bin.
+
+        Raises:
+            ValueError: if there is none, or it is too thin.
+        """
+        return fitting(item, self.spec, to_mm(item.sides, self.spec.unit_mm), "box")
+
+    def _offer(
+        self, call: str, sides: Sequence[float], order: str, attributes: Mapping[str, Any]
+    ) -> _Offer:
         """Return what :meth:`place` would do with a box."""
-        last = self._offered
-        if last is not None and last.order == order and last.given.same(item):
+        if self._selects:
+            raise ValueError(
+                f"{call}: with a buffer or a preview, show(box) tells of a box, and place_next() "
+                "chooses and places one"
+            )
+        item, last = calls.goods_of(sides, attributes, self.spec), self._offered
+        if (
+            last is not None
+            and last.given is not None
+            and last.known.order == order
+            and last.given.same(item)
+        ):
             return last
-        if not isinstance(order, str):
-            raise ValueError(f"order {shown(order)}: needs a text")
-        try:
-            able = fitting(item, self.spec, to_mm(item.sides, self.spec.unit_mm), "box")
-        except ThinError:
-            reason = f"it is lower than level_tolerance_mm = {self.spec.level_tolerance_mm:g}"
-            self._offered = _Offer(item, order, item, _no(item, "too_thin", reason))
-        except ValueError:
-            size = " x ".join(f"{side:g}" for side in self.spec.bin_mm)
-            reason = f"it fits into an empty bin of {size} mm in no orientation that it may take"
-            self._offered = _Offer(item, order, item, _no(item, "too_large", reason))
+        able, refusal = able_or_refused(item, self.spec)
+        known = Known(able, check_order(order))
+        if refusal is None:
+            self._offered = replace(self._choose([known]), given=item)
         else:
-            self._offered = _Offer(item, order, able, *self._choose(able, order))
+            self._offered = _Offer(known, refusal, given=item)
         return self._offered
 
-    def _choose(
-        self, item: Goods, order: str
-    ) -> tuple[Placement | NoPlace, int, Explanation | None]:
-        """Choose a place in the open bin or, if there is none, in the next one.
+    def _offer_next(self, call: str) -> _Offer:
+        """Return what :meth:`place_next` would do."""
+        if not self._known:
+            raise ValueError(f"{call}: no box is known; show(box) tells of one")
+        if self._offered is None:
+            self._offered = self._choose(self._known)
+        return self._offered
 
-        Returns:
-            The answer, the move (-1: no place) and, if it is asked for, the explanation.
-        """
-        more = self.most_bins is None or len(self.packed) < self.most_bins
-        empty = not self.packed[-1]
-        fits_order = self._fits_order(order)
-        bins = {len(self.packed) - 1: self.bin} if fits_order else {}
-        if not empty and more and (self.open_next or not fits_order):
-            bins[len(self.packed)] = ExactBins(1, self.spec)
-        for k, bin in bins.items():
-            turn = Turn(bin, item, self._shown)
-            move = int(self.policy(turn)[0]) if turn.alive[0] else -1
-            if move < 0:
-                continue
-            if not bin.legal(item, np.array([move]))[0]:
-                raise ValueError(f"the policy chose a move that is not legal: {move}")
-            row = _row_of(item, move)
-            support = measure(bin, row, float(bin.weights_of(item)[0][0]), bin.blocked(0, item))
-            why = explain(self.policy, turn, 0, move) if self.arguments["explain"] else None
-            return self._answer(item, row, move & 7, support, k), move, why
-        if not bins:
+    def _choose(self, known: Sequence[Known]) -> _Offer:
+        """Choose a visible box and a place in an open bin or, if there is none, in the next one."""
+        bins, first = self._bins, known[0]
+        tried = {k: bin for k, bin in bins.open.items() if bins.admits(k, first.order)}
+        offer = self._decide(known, bins.open)
+        if offer is None and bins.may_open() and (self.open_next or not tried):
+            new = {len(bins): ExactBins(1, self.spec)}
+            tried = tried or new
+            offer = self._decide(known, new)
+        if offer is not None:
+            return offer
+        if tried:
+            answers = [why_not(bin, first.item) for bin in tried.values()]
+            no = next((answer for answer in answers if answer.code == "policy"), answers[0])
+        else:
             many = self.most_bins != 1
             bins_used = f"all {self.most_bins} bins are used" if many else "the only bin is used"
-            return _no(item, "other_order", f"it begins an order, and {bins_used}"), -1, None
-        return why_not(self.bin if fits_order else bins[len(self.packed)], item), -1, None
+            reason = f"it begins an order, and {bins_used}"
+            no = NoPlace(str(first.item.ids[0]), "other_order", reason)
+        return _Offer(first, replace(no, number=first.number))
 
-    def _support(self, item: Goods, row: NDArray[np.int64]) -> Support:
-        """Measure the support of a box at a row of the open bin."""
-        weight = float(self.bin.weights_of(item)[0][0])
-        return measure(self.bin, row, weight, self.bin.blocked(0, item))
-
-    def _answer(
-        self, item: Goods, row: NDArray[np.int64], orientation: int, support: Support,
-        bin: int | None = None,
-    ) -> Placement:  # fmt: skip
-        """Return the placement of a box at a row."""
-        x, y, z, w, d, h = to_mm(row[:6], self.spec.unit_mm).tolist()
-        return Placement(
-            str(item.ids[0]), len(self.packed) - 1 if bin is None else bin, orientation, x, y, z, w,
-            d, h, (x + w / 2, y + d / 2, z + h / 2), support.share,
-            _margin(support, self.spec.unit_mm),
+    def _decide(self, known: Sequence[Known], open: Mapping[int, ExactBins]) -> _Offer | None:
+        """Let the policy choose a visible box and its place in one of these bins; None: nowhere."""
+        numbers = {box.number for box in known}
+        before = [item for n, item in enumerate(self._shown) if n not in numbers]
+        made = decide(self.policy, known, self.buffer, self._bins, open, before)
+        if made is None:
+            return None
+        box, explains = made.known, self.arguments["explain"]
+        why = explain(self.policy, made.turn, made.option, made.move) if explains else None
+        answer = self._bins.placement(
+            made.bin, open[made.bin], box.item, row_of(box.item, made.move), made.move & 7,
+            box.number,
         )  # fmt: skip
-
-
-def _no(item: Goods, code: str, reason: str) -> NoPlace:
-    """Return that an item has no place."""
-    return NoPlace(str(item.ids[0]), code, reason)
-
-
-def _margin(support: Support, unit_mm: float) -> float | None:
-    """Return a margin in millimetres; None if nothing carries."""
-    return None if np.isnan(support.margin) else float(to_mm(support.margin, unit_mm))
-
-
-def _whole(row: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the row of the state of a box whose whole top carries, int64 [10]."""
-    return np.concatenate((row, row[:2], row[:2] + row[3:5]))
-
-
-def _row_of(item: Goods, move: int) -> NDArray[np.int64]:
-    """Return the row of the state of an item at a move, int64 [10]."""
-    where = placements(move)
-    return _whole(np.concatenate((where[1:], item.sides[0][AXES[where[0]]])))
-
-
-def _whole_numbers(values: Sequence[float]) -> bool:
-    return all(float(value).is_integer() for value in values)
+        return _Offer(box, answer, made.move, why)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from marl_pack import published, renamed
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.checks import shown
+from marl_pack.exact.bins import NOWHERE
 from marl_pack.exact.futures import Catalogue, Futures, Shown
 from marl_pack.exact.policies import (
     NAMES,
@@ -30,14 +31,15 @@ from marl_pack.packer.turn import Turn
 
 SEARCH = "search"
 PackerPolicy = Callable[[Turn], NDArray[np.int64]]
-"""``turn -> moves``, int64 [1]; NOWHERE if the box has no place."""
+"""``turn -> moves``, a move for each option, int64 [G]; NOWHERE where the box has no place, or to
+leave the option out."""
 PACKER_POLICIES = (*NAMES, SEARCH)
 """Names of policies that need no file."""
 
 
 @dataclass(frozen=True)
 class SeededMoves:
-    """Random moves that depend only on the seed and on how many boxes were shown.
+    """A random option and move, which depend only on the seed and the number of the decision.
 
     Args:
         seed: seed of the draws.
@@ -46,10 +48,13 @@ class SeededMoves:
     seed: int
 
     def __call__(self, turn: Turn) -> NDArray[np.int64]:
-        """Return one of the legal moves, int64 [1]."""
+        """Return a legal move for one option that has any, int64 [G]."""
         generator = np.random.default_rng((self.seed, turn.number))
         moves: NDArray[np.int64] = RandomMoves(generator)(turn)  # type: ignore[arg-type]  # a Turn has all that it reads
-        return moves
+        options = np.flatnonzero(moves >= 0)
+        if len(options) < 2:
+            return moves
+        return np.where(np.arange(len(moves)) == generator.choice(options), moves, NOWHERE)
 
 
 def make_packer_policy(
@@ -111,7 +116,7 @@ def _search(policy: Any, spec: ExactSpec, plan: Any, catalogue: Any, seed: int) 
         scored = make_exact_policy(policy)
         assert isinstance(scored, Scored)
         weights = scored.weights
-    return Search(weights, plan, futures, seed)  # type: ignore[return-value]  # as above
+    return Search(weights, plan, futures, seed)
 
 
 def _agents(policy: Any, spec: ExactSpec, grid_mm: float | None, seed: int) -> PackerPolicy:

@@ -21,6 +21,7 @@ def warm_up(arguments: Mapping[str, Any]) -> None:
     packer = Packer(**{**arguments, **({"plan": "budget=1ms"} if searches else {})})
     side = float(to_mm(max(1, min(packer.spec.size) // 3), packer.spec.unit_mm))
     for _ in range(3):
-        packer.place((side, side, side), weight=1.0)
+        packer.show((side, side, side), weight=1.0)
+        packer.place_next()
     why_not(packer.bin, goods_of((side, side, side), {}, packer.spec))
     packer.state, packer.plan  # noqa: B018  # read for what they compile

@@ -167,6 +167,7 @@ def _record(name: str, sentence: str, record: Any, example: Any) -> Any:
     known: Any = {
         each.name: (hints[each.name], ... if each.default is MISSING else each.default)
         for each in fields(record)
+        if each.name != "number"  # only boxes that were shown have one
     }
     model = create_model(name, __doc__=sentence, __base__=Stepped, **known)
     model.model_config["json_schema_extra"] = {"examples": [example]}
