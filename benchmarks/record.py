@@ -40,7 +40,7 @@ PROGRAMS = {
     "selection": "experiments.packing --tables selection",
     **{name: f"experiments.{name}" for name in (
         "ablations", "learning_curve", "planning", "afterstates", "volume_spread",
-        "real_goods", "real_cell", "packer")},
+        "real_goods", "real_cell", "packer", "packer_selection")},
     **{name: f"experiments.physics {name}" for name in ("controls", "table1")},
     **{name: f"benchmarks.{name}" for name in (
         "masks", "rules", "room", "game", "training", "play", "exact", "page", "service")},
