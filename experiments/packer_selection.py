@@ -40,6 +40,8 @@ MOST_BOXES = 4000
 """Boxes that come in an episode of several bins, at most."""
 EPISODES = {"buffer": 60, "preview": 30, "bins": 10}
 """Episodes of a row at most, the first ones of a stream."""
+FIRST = {"buffer": BUFFERS[0], "preview": PREVIEWS[0], "bins": OPEN_BINS[0]}
+"""The value that others are compared with."""
 PLAN = "budget=1000s,top=4,futures=4"
 
 

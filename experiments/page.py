@@ -21,7 +21,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from benchmarks.record import PROGRAMS, RESULTS, ROOT, Results, made_by, reported
 from docs.pages import between
 from docs.pages import table as markdown_table
-from experiments import ablations, packer, packing, physics, planning, real_cell, real_goods
+from experiments import (
+    ablations,
+    packer,
+    packer_selection,
+    packing,
+    physics,
+    planning,
+    real_cell,
+    real_goods,
+)
 from experiments.rows import main_of, mean
 from marl_pack.exact.spec import ExactSpec
 from marl_pack.files import write_atomically
@@ -191,7 +200,14 @@ def render_packer(folder: Path = RESULTS) -> str:
                 "height": ", ".join(f"{b['height_mm']:g}" for b in bins),
             }  # fmt: skip
 
+    def selected(option: str, stream: str, policy: str, number: int) -> dict[str, Any]:
+        rows = tables["packer_selection"]
+        first = packer_selection.FIRST[option]
+        own, base = (rows.row(f"{option} {stream} {policy} {n}") for n in (number, first))
+        return {**own, "gain": mean(np.array(own["each"]) - np.array(base["each"]))}
+
     return template("packer").render(
+        selection=packer_selection, selected=selected,
         made=lambda name: made(tables[name]), streams=real_goods.BINS,
         policies=(*heuristics, *budgets), equal=f"{sum(equal)} of {len(equal)} rows are equal",
         figures=lambda stream, policy: row(f"{stream} {policy}"), utilization=utilization,

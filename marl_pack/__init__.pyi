@@ -28,6 +28,7 @@ from .items import Stream as Stream
 from .items import make_stream as make_stream
 from .packer.answers import NoPlace as NoPlace
 from .packer.answers import Placement as Placement
+from .packer.answers import Waiting as Waiting
 from .packer.packer import Packer as Packer
 from .packer.poses import Pose as Pose
 from .plan import Plan as Plan

@@ -16,6 +16,7 @@ from test_packer import BIN, KINDS, boxes, check_plan
 from marl_pack import Plan, pack
 from marl_pack.exact.bins import NOWHERE, ExactBins
 from marl_pack.exact.futures import Shown
+from marl_pack.exact.goods import joined
 from marl_pack.exact.options import Options
 from marl_pack.exact.policies import HEURISTICS, TUNED, read_weights
 from marl_pack.exact.search import Search, _Trial
@@ -80,7 +81,7 @@ def test_without_options_each_box_gets_the_best_place_in_the_open_bin() -> None:
 @pytest.mark.parametrize("policy", POLICIES)
 def test_one_box_that_is_shown_is_placed_like_one_that_is_not(policy: str) -> None:
     one, other = packer_of((1, 0, 1), policy, seed=4), packer_of((1, 0, 1), policy, seed=4)
-    for box in boxes(5, 12):
+    for box in boxes(5, 8):
         placed, waits = one.place(**box), other.show(**box)
         assert isinstance(waits, Waiting)
         shown = other.place_next()
@@ -219,7 +220,7 @@ def test_an_order_begins_when_its_box_is_the_first_that_waits() -> None:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("variant", [(3, 2, 2), (3, 0, 1), (1, 2, 1)])
+@pytest.mark.parametrize("variant", [(3, 2, 2), (1, 2, 1)])
 def test_undo_and_restore_bring_everything_back(
     policy: str, variant: tuple[int, int, int], tmp_path: Path
 ) -> None:
@@ -227,7 +228,7 @@ def test_undo_and_restore_bring_everything_back(
     more = {"clearance_mm": 10, "present": [[0, 0, 0, 100, 100, 300]], "explain": policy == "rs"}
     packer = packer_of(variant, policy, **more)
     given, kinds = iter(boxes(4, 100)), set()
-    for step in range(16 if policy in ("search", "rs") else 40):
+    for step in range(12 if policy in ("search", "rs") else 30):
         before = content(packer, tmp_path)
         kind = ["place", "place", "next_bin", "actual", "skip"][rng.integers(5)]
         kind = "show" if packer.needs_box and step < 30 else kind
@@ -278,8 +279,8 @@ def test_the_pose_of_the_last_box_is_reported_in_whichever_bin_it_is() -> None:
 
 def test_explanations_are_those_of_the_chosen_box_and_bin() -> None:
     for policy in POLICIES:
-        packer = packer_of((3, 1, 2), policy, explain=True)
-        list(feed(packer, boxes(3, 8)))
+        packer = packer_of((2, 1, 2), policy, explain=True)
+        list(feed(packer, boxes(3, 5)))
         plan = packer.plan
         for k, why in enumerate(plan.explanations):
             assert why is not None
@@ -298,8 +299,6 @@ def test_a_future_begins_with_the_known_boxes() -> None:
         goods_of(sides, {}, spec)
         for sides in ((300, 300, 100), (300, 300, 60), (300, 300, 110), (300, 300, 25))
     ]
-    from marl_pack.exact.goods import joined
-
     goods = joined(known, spec.unit_mm)
     options = Options(ExactBins(1, spec), goods, 2, np.array([[0, 0], [1, 0]]))
     moves = options.bins.best(options.items, 1, np.zeros(13))
@@ -312,16 +311,16 @@ def test_a_future_begins_with_the_known_boxes() -> None:
 
 def test_a_search_knows_the_preview_and_nothing_more() -> None:
     """Its choices depend on the known boxes, and not on those that come later."""
-    given = boxes(9, 24)
-    settings = ExactSearchSettings(budget_ms=1e6, top=4, futures=6)
+    given = boxes(9, 14)
+    settings = ExactSearchSettings(budget_ms=1e6, top=2, futures=6)
 
     def packed(preview: int, given: list[dict[str, Any]]) -> list[Any]:
         search = Search(read_weights(TUNED), settings, Shown())
         packer = packer_of((1, preview, 1), search)
         return [answer.to_dict() for answer in feed(packer, given)]
 
-    changed = given[:12] + boxes(10, 12)
-    assert packed(3, given)[:9] == packed(3, changed)[:9]
+    changed = given[:9] + boxes(10, 5)
+    assert packed(3, given)[:6] == packed(3, changed)[:6]
     assert packed(3, given) != packed(0, given)
 
 
