@@ -614,7 +614,7 @@ MUTATIONS = (
     _m("replay: a film shows the next box in the bin already", "render/animation.py",
        "here = int((of_bin < step).sum())", "here = int((of_bin <= step).sum())",
        "replay::a_frame_shows_the_boxes_that_are_placed"),
-    # --- packer: buffer, preview, open bins --------------------------------------------------------
+    # --- packer: buffer, preview, open bins -------------------------------------------------------
     _m("packer: the emptiest bin is closed", "packer/open_bins.py",
        "fullest = max(self.open,", "fullest = min(self.open,",
        "packer_selection::every_packing_is_right_and_follows_the_rule_of_closing"),
