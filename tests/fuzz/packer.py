@@ -60,6 +60,18 @@ def check_plan(plan: Plan, unit: float, tolerance: float) -> None:
         assert supported.all(), "floats"
 
 
+def place(packer: Packer, box: dict[str, Any]) -> None:
+    """Place a box as it was offered; with a buffer or a preview, show it or place a known one."""
+    if packer.buffer + packer.preview == 1:
+        offered = packer.offer(**box)
+        assert packer.place(**box) == offered
+    elif packer.needs_box:
+        packer.show(**box)
+    else:
+        offered = packer.offer_next()
+        assert packer.place_next() == offered
+
+
 def case_of(seed: list[int]) -> None:
     """Make random calls and check them.
 
@@ -73,6 +85,9 @@ def case_of(seed: list[int]) -> None:
     items = goods.pop("items")
     names = {"weights": "weight", "max_load": "max_load", "stackable": "stackable"}
     policy = str(generator.choice(["random", "max_contact", "dblf", "linear"]))
+    if generator.random() < 0.5:
+        buffer, preview, open_bins = generator.integers((1, 0, 1), (4, 3, 4)).tolist()
+        options |= {"buffer": buffer, "preview": preview, "open_bins": open_bins}
     packer = Packer(policy=policy, bins=3, seed=3, **options)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "saved.json")
@@ -88,8 +103,7 @@ def case_of(seed: list[int]) -> None:
             before = saved()
             try:
                 if kind == "place":
-                    offered = packer.offer(**box)
-                    assert packer.place(**box) == offered
+                    place(packer, box)
                 elif kind == "actual":
                     last = packer.placements[-1] if packer.placements else None
                     if isinstance(last, Placement):
@@ -97,7 +111,7 @@ def case_of(seed: list[int]) -> None:
                         error = generator.uniform(-1, 1, 3) * (0.02 * last.w, 0.02 * last.d, 3)
                         packer.actual((x + error[0], y + error[1], error[2]))
                 elif kind == "skip":
-                    packer.skip(**box)
+                    packer.skip_next() if packer.waiting else packer.skip(**box)
                 elif kind == "next_bin":
                     packer.next_bin()
                 elif kind == "restore":
@@ -115,7 +129,7 @@ def case_of(seed: list[int]) -> None:
                 assert saved() == before, f"undo of {kind}"
                 packer = Packer.restore(path)
                 if kind == "place":
-                    packer.place(**box)
+                    place(packer, box)
                     assert saved() == after, "place again"
         check_plan(packer.plan, unit, options.get("level_tolerance_mm", 0.0))
 
