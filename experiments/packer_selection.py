@@ -38,7 +38,7 @@ CLOSINGS = 5
 """Bins that are closed in an episode, for each open bin."""
 MOST_BOXES = 4000
 """Boxes that come in an episode of several bins, at most."""
-EPISODES = {"buffer": 60, "preview": 30, "bins": 10}
+EPISODES = {"buffer": 60, "preview": 16, "bins": 8}
 """Episodes of a row at most, the first ones of a stream."""
 FIRST = {"buffer": BUFFERS[0], "preview": PREVIEWS[0], "bins": OPEN_BINS[0]}
 """The value that others are compared with."""
