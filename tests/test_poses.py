@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from marl_pack import Plan, Stack
 from marl_pack.geometry.rotated import overlap, overlap_area
 from marl_pack.packer.answers import Placement
+from marl_pack.packer.calls import goods_of
 from marl_pack.packer.packer import Packer
 from marl_pack.packer.poses import Pose, rectangles
 from marl_pack.sapien_check.trials import Trial, run_trial
@@ -97,10 +98,14 @@ def test_only_the_inner_rectangle_carries(rule: str) -> None:
     packer = Packer((1000, 600, 1000), "dblf", rule=rule, clearance_mm=60, orientations=(0,))
     first = packer.place((600, 300, 100))
     assert isinstance(first, Placement)
-    before = packer.bin.moves_at(0, packer._goods((100, 100, 100), {}), np.array([[6050, 1000]]))
+    before = packer.bin.moves_at(
+        0, goods_of((100, 100, 100), {}, packer.spec), np.array([[6050, 1000]])
+    )
     assert len(before) > 0  # 55 of 100 mm rest on it
     packer.actual((first.centre[0], first.centre[1], 5.0))
-    after = packer.bin.moves_at(0, packer._goods((100, 100, 100), {}), np.array([[6050, 1000]]))
+    after = packer.bin.moves_at(
+        0, goods_of((100, 100, 100), {}, packer.spec), np.array([[6050, 1000]])
+    )
     assert len(after) == 0  # the rectangle inside ends 9.8 mm earlier
 
 
@@ -166,7 +171,7 @@ def test_limits_hold_in_the_space_of_a_rotated_box() -> None:
     around, inside = rectangles(2000, 2000, 2000, 400, 35)
     corner = np.array([[around[2] - 300, around[3] - 300]])  # outside of the inner rectangle
     assert (corner[0] > inside[2:]).all()
-    item = packer._goods((100, 100, 100), {})
+    item = goods_of((100, 100, 100), {}, packer.spec)
     assert len(packer.bin.moves_at(0, item, corner)) == 0
 
 
