@@ -208,6 +208,7 @@ def render_packer(folder: Path = RESULTS) -> str:
 
     return template("packer").render(
         selection=packer_selection, selected=selected,
+        bound=tables["real_goods"].row(f"cases {real_goods.BOUND}")["utilization"],
         made=lambda name: made(tables[name]), streams=real_goods.BINS,
         policies=(*heuristics, *budgets), equal=f"{sum(equal)} of {len(equal)} rows are equal",
         figures=lambda stream, policy: row(f"{stream} {policy}"), utilization=utilization,
