@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from marl_pack.evaluation.statistics import strict_equilibrium
-from marl_pack.files import check_writable, write_atomically
+from marl_pack.files import check_writable
+from marl_pack.game.spec import SelectionSpec
 from marl_pack.geometry import ORIENTATIONS
 from marl_pack.options import GAME_NOTE, add_explain, add_options, check_explain, check_names
-from marl_pack.plan import Plan
 from marl_pack.plan_archive import check_ending, save_plan
 from marl_pack.render.choices import ENDINGS
 from marl_pack.terminal import Parser, make_console, make_status
@@ -37,7 +37,7 @@ def parser(program: str = PROGRAM) -> Parser:
             "--policy runs/NAME --items boxes.csv --episode 3 --save plan.json",
         ),
     )  # fmt: skip
-    add_options(options)
+    add_options(options, SelectionSpec)
     options.add_argument_group("episode").add_argument(
         "--episode", type=int, default=0, help="number of the sequence (default: 0)"
     )
@@ -68,7 +68,9 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
         check_explain(chosen.save, "--save")
     check_names(chosen)
     with make_status(console, "loading the player"):
-        from marl_pack.agents.explaining import explain  # slow to import
+        import torch  # slow to import, as are these
+
+        from marl_pack.agents.explaining import explain
         from marl_pack.evaluation.rollout import Reasons
         from marl_pack.players import choose, set_threads
 
@@ -81,49 +83,52 @@ def run(chosen: argparse.Namespace, console: Console) -> None:
     if chosen.episode < 0 or (episodes and chosen.episode >= episodes):
         most = f" … {episodes - 1}" if episodes else " or more"
         raise ValueError(f"--episode {chosen.episode}: needs 0{most}")
+    if chosen.explain and setup.spec.selects:
+        raise ValueError("--explain: goes with games of one visible box and one bin")
     game = setup.game(1, chosen.episode)
+    first = torch.zeros(1, dtype=torch.int64)
     title = f"{name} plays {setup}, episode {chosen.episode}"
     table = Table()
-    for column in ("item", "w d h", "orientation", "x y z", "reward", "utilization"):
+    several = ("bin",) if setup.spec.bins > 1 else ()
+    for column in ("item", *several, "w d h", "orientation", "x y z", "reward", "utilization"):
         table.add_column(column, justify="right")
     reasons = Reasons(1)
     with make_status(console, "playing") as status:
         while bool(game.alive):
-            item, count = game.items.sides[0].tolist(), int(game.bins.count)
-            status.update(f"playing: item {count + 1}")
-            orientation, cell = policy(game)
-            explained = explain(policy, game, (orientation, cell)) if chosen.explain else None
-            outcome = game.place(orientation, cell)
+            status.update(f"playing: item {len(table.rows) + 1}")
+            choice = policy(game)
+            explained = explain(policy, game, choice) if chosen.explain else None
+            *option, orientation, cell = choice
+            # The chosen box and bin, in a copy: a bin may be closed by the placement.
+            alone = game.view(game.rows(option[0])) if option else game.branch(first)
+            count, item = int(alone.bins.count), alone.items.sides[0].tolist()
+            alone.place(orientation, cell)
+            outcome = game.place(*choice)
             reasons.add(explained, outcome.placed.tolist())
             # Without a mask of orientations the choice may have no legal cell; this ends the game.
-            placed = int(outcome.placed) > count
+            placed = int(alone.bins.count) > count
             axes = "".join("wdh"[axis] for axis in ORIENTATIONS[int(orientation)])
+            position = alone.bins.boxes[0, count, :3].tolist() if placed else ["nowhere"]
             table.add_row(
-                str(count + 1),
+                str(len(table.rows) + 1),
+                *(str(int(option[0]) % setup.spec.bins) for _ in several),
                 " ".join(map(str, item)),
                 axes,
-                " ".join(map(str, game.bins.boxes[0, count, :3].tolist())) if placed else "nowhere",
+                " ".join(map(str, position)),
                 f"{float(outcome.reward):+.3f}",
                 f"{float(outcome.utilization):.1%}",
             )
     console.print(title, soft_wrap=True)
     console.print(table)
 
-    from matplotlib.image import imsave
-
     from marl_pack.render.animation import Film, save_film
-    from marl_pack.render.picture import draw
 
-    (plan,) = reasons.of([Plan.from_bins(game.bins.to("cpu"), 0)])
+    (plan,) = reasons.of(game.plans())
     balance = "in strict equilibrium" if strict_equilibrium(plan) else "NOT in equilibrium"
     ending = f"{len(plan)} boxes, utilization {plan.utilization:.1%}, {balance}"
     console.print(ending)
     with make_status(console, "drawing the bin"):
-        if chosen.picture.suffix.lower() != ".png":
-            save_film(chosen.picture, Film(plan, name))
-        else:
-            image = draw(game.size, plan.boxes, title=f"{name}: {ending}")
-            write_atomically(chosen.picture, lambda file: imsave(file, image, format="png"))
+        save_film(chosen.picture, Film(plan, name))
     console.print(f"picture: {chosen.picture}", soft_wrap=True)
     if chosen.save is not None:
         save_plan(chosen.save, plan)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from marl_pack import Packing, SearchSettings, evaluate, load
+from marl_pack import Packing, Plan, SearchSettings, evaluate, load, play
 from marl_pack.agents.afterstates.gains import gains
 from marl_pack.agents.heuristics import HEURISTICS
 from marl_pack.agents.selection.beam import Beam, best_of_each, distinct
@@ -531,3 +531,21 @@ def test_what_evaluate_refuses(
         evaluate.main([*arguments, "--episodes", "2"])
     assert stop.value.code == 2
     assert words in capsys.readouterr().err
+
+
+def test_play_shows_box_and_bin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--policy", "dblf", "--bin", "5", "5", "5", "--sides", "1", "4", "--seed", "1"]
+    variant = ["--buffer", "2", "--bins", "2", "--closings", "2"]
+    plan_file, picture = tmp_path / "plan.json", tmp_path / "bins.png"
+    outputs = ["--save", str(plan_file), "--picture", str(picture)]
+    assert play.main([*words, *variant, *outputs]) == 0
+    plan = Plan.from_json(plan_file)
+    printed = capsys.readouterr().out
+    assert f"{len(plan)} boxes, utilization {plan.utilization:.1%}" in printed
+    assert len(plan.bin_sizes) == 3
+    assert picture.is_file()
+    for position in plan.positions.tolist():
+        assert " ".join(map(str, position)) in printed
+    with pytest.raises(SystemExit):
+        play.main([*words, *variant, *outputs, "--explain"])
+    assert "--explain: goes with games of one visible box" in capsys.readouterr().err
