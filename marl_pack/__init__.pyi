@@ -6,6 +6,7 @@ from .agents.player import load as load
 from .agents.policy import Policy as Policy
 from .agents.search_settings import SearchSettings as SearchSettings
 from .agents.selection.beam_settings import BeamSettings as BeamSettings
+from .agents.selection.budget_settings import BudgetSettings as BudgetSettings
 from .bins import Bins as Bins
 from .env_aec import env as env
 from .env_aec import parallel_env as parallel_env

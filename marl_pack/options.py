@@ -10,6 +10,7 @@ from marl_pack import published
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.search_settings import SearchSettings
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.budget_settings import BudgetSettings
 from marl_pack.agents.sources import check_source, path_of, resolve
 from marl_pack.exact.spec import ORDERS, ExactSpec
 from marl_pack.game.spec import GameSpec
@@ -69,8 +70,10 @@ def add_options(options: argparse.ArgumentParser, spec: type[GameSpec] = GameSpe
     add("--placement", metavar="NAME",
         help=f"with --orientation: the placement agent: {', '.join(POLICIES)}, {models}, "
              f"or {learned}")  # fmt: skip
-    add("--plan", metavar="rollouts=K,top=M",
-        help="learned agents try their M best pairs in K imagined futures before each placement; "
+    add("--plan", metavar="budget=T",
+        help="budget=100ms: before each placement a search with the critic of learned agents draws "
+             "boxes that may come, for this time; draws=N limits their number. rollouts=K,top=M: "
+             "learned agents try their M best pairs in K imagined futures; "
              f"depth=D ends each future after D items by the critic's value{beam}")  # fmt: skip
     add("--symmetric", action="store_true",
         help="ask learned agents in all symmetries of the bin and take the action that is most "
@@ -153,7 +156,9 @@ def check_names(arguments: argparse.Namespace) -> None:
     ):
         if name is not None and name not in names:
             resolve(path_of(name, names))
-    if arguments.plan is not None and any(
+    if arguments.plan is not None and BudgetSettings.are_in(arguments.plan):
+        BudgetSettings.parse(arguments.plan)
+    elif arguments.plan is not None and any(
         getattr(arguments, name, None) is not None for name in SELECTION
     ):
         BeamSettings.parse(arguments.plan)

@@ -17,6 +17,7 @@ from rich.console import Console
 from marl_pack.agents.keys import ORIENTATION_AGENTS, POLICIES
 from marl_pack.agents.policy import InTurns, Policy
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.budget_settings import BudgetSettings
 from marl_pack.agents.selection.choosing import selection_policy_of
 from marl_pack.agents.selection.policies import SelectionPolicy
 from marl_pack.agents.sources import is_own
@@ -111,11 +112,12 @@ def choose(arguments: argparse.Namespace, console: Console) -> Setup:
     whole_number(arguments.seed, "--seed", 0, LARGEST_SEED)
     policies, trained = choose_policies(arguments, console)
     stream, items, sides, spec = choose_game(arguments, trained)
+    draws = arguments.plan is not None and BudgetSettings.are_in(arguments.plan)
+    if draws or (arguments.plan is not None and not spec.selects):
+        policies = with_search(policies, arguments, stream, spec.bin)
     if spec.selects:
         selecting = with_selection(policies, arguments)
         return Setup(selecting, stream, items, sides, spec, arguments)
-    if arguments.plan is not None:
-        policies = with_search(policies, arguments, stream, spec.bin)
     return Setup(policies, stream, items, sides, spec, arguments)
 
 
@@ -204,7 +206,9 @@ def with_selection(
         raise ValueError(
             "--orientation, --placement, --symmetric: go with games of one visible box and one bin"
         )
-    settings = None if arguments.plan is None else BeamSettings.parse(arguments.plan)
+    settings = None
+    if arguments.plan is not None and not BudgetSettings.are_in(arguments.plan):
+        settings = BeamSettings.parse(arguments.plan)
     chosen: dict[str, SelectionPolicy] = {}
     for name, policy in policies.items():
         searches = settings if name not in POLICIES and not is_own(name) else None
@@ -233,7 +237,8 @@ def with_search(
     from marl_pack.agents.loading import Loader, imagined_stream
     from marl_pack.agents.search_settings import SearchSettings
 
-    settings = SearchSettings.parse(arguments.plan)
+    form = BudgetSettings if BudgetSettings.are_in(arguments.plan) else SearchSettings
+    settings = form.parse(arguments.plan)
     fixed = [name for name in policies if name in POLICIES or is_own(name)]
     if len(fixed) == len(policies) or arguments.orientation is not None:
         raise ValueError("--plan: needs --policy with a run's folder or checkpoint")
@@ -248,5 +253,9 @@ def with_search(
         except ValueError as error:
             raise ValueError(f"--plan: {error}") from None
         loader = Loader(arguments.device, arguments.seed, arguments.symmetric)
-        policies_with_search[f"{name}, {settings}"] = loader.planner(checkpoint, settings, futures)
+        try:
+            planner = loader.planner(checkpoint, settings, futures)
+        except ValueError as error:
+            raise ValueError(f"--policy {name}: {error}") from None
+        policies_with_search[f"{name}, {settings}"] = planner
     return policies_with_search

@@ -36,7 +36,10 @@ from marl_pack.agents.policy import (
 )
 from marl_pack.agents.search import Planner
 from marl_pack.agents.search_settings import SearchSettings
-from marl_pack.agents.selection.choosing import make_selection_agent
+from marl_pack.agents.selection.budget import BudgetSearch
+from marl_pack.agents.selection.budget_settings import BudgetSettings
+from marl_pack.agents.selection.choosing import lookahead_of, make_selection_agent
+from marl_pack.agents.selection.one_box import OneBoxSearch
 from marl_pack.agents.selection.policies import (
     GreedyValue,
     SelectAs,
@@ -196,8 +199,11 @@ class Loader:
         return lookahead
 
     def planner(
-        self, checkpoint: Mapping[str, Any], settings: SearchSettings, futures: Stream
-    ) -> Planner:
+        self,
+        checkpoint: Mapping[str, Any],
+        settings: SearchSettings | BudgetSettings,
+        futures: Stream,
+    ) -> Planner | OneBoxSearch:
         """Return a policy that searches with the agents of a checkpoint.
 
         Args:
@@ -207,8 +213,11 @@ class Loader:
 
         Raises:
             ValueError: if an agent is not learned, or the settings have a depth and the critic was
-                not trained to estimate filled shares of the bin.
+                not trained to estimate filled shares of the bin, or they have a budget and there is
+                no critic of afterstates.
         """
+        if isinstance(settings, BudgetSettings):
+            return OneBoxSearch(self._budget_search(checkpoint, settings, futures))
         first, second = (
             self.learned(checkpoints.agent_record(checkpoint, name), name)
             for name in (ORIENTATION, PLACEMENT)
@@ -224,6 +233,19 @@ class Loader:
                 )
             critic = load_critic(checkpoint, ORIENTATION, self.device, first.actor)
         return Planner(first, second, critic, settings, futures, self.seed or 0)
+
+    def _budget_search(
+        self, checkpoint: Mapping[str, Any], settings: BudgetSettings, futures: Stream
+    ) -> BudgetSearch:
+        """Return a search that uses the critic of afterstates of a checkpoint."""
+        if self.symmetric:
+            raise ValueError("symmetric: a search with a budget does not ask the agents")
+        lookahead = lookahead_of(self.policy_of(checkpoint))
+        if lookahead is None:
+            raise ValueError(
+                "plan: a budget or draws need agents with a critic of afterstates, such as rs"
+            )
+        return BudgetSearch(lookahead, settings, futures, self.seed or 0)
 
 
 def imagined_stream(

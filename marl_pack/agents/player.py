@@ -15,6 +15,7 @@ from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.policy import InTurns, Placement, Policy
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.budget_settings import BudgetSettings
 from marl_pack.agents.selection.policies import SelectFirst
 from marl_pack.agents.sources import is_own, own_policy
 from marl_pack.bins import check_device
@@ -34,7 +35,7 @@ def load(
     seed: int | None = 0,
     *,
     symmetric: bool = False,
-    search: SearchSettings | BeamSettings | None = None,
+    search: SearchSettings | BeamSettings | BudgetSettings | None = None,
 ) -> Player:
     """Return the player that ``source`` names.
 
@@ -48,7 +49,7 @@ def load(
         symmetric: whether learned agents average over the symmetries of the bin.
         search: how far learned agents search before each placement; None for no search. Future
             items are drawn from the distribution of the items in training. ``BeamSettings`` are for
-            games with a buffer, a preview or several bins.
+            games with a buffer, a preview or several bins; ``BudgetSettings`` are for all games.
 
     Raises:
         ValueError, FileNotFoundError: if there is no such player, or it does not support an option.
@@ -73,8 +74,10 @@ def load(
         return Player(loader.policy(source))
     if isinstance(search, BeamSettings):
         return Player(loader.policy(source), search)
-    if not isinstance(search, SearchSettings):
-        raise ValueError(f"search = {shown(search)}: needs SearchSettings or BeamSettings")
+    if not isinstance(search, SearchSettings | BudgetSettings):
+        raise ValueError(
+            f"search = {shown(search)}: needs BudgetSettings, SearchSettings or BeamSettings"
+        )
     checkpoint = checkpoints.read(source, device)
     try:
         futures = imagined_stream(checkpoint).to(device)

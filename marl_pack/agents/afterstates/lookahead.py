@@ -100,10 +100,8 @@ class Lookahead:
         """Compute the afterstate of each legal placement."""
 
         def compute() -> Afterstates:
-            width, depth, _ = game.size
-            code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
             sides = game.orient_item(game.items).sides
-            return code(game.bins, sides, game.mask, probe_lengths(*game.stream.sides))
+            return self.after(game.bins, sides, game.mask, game)
 
         return self.memo.once(game, "afterstates", compute)
 
@@ -146,24 +144,54 @@ class Lookahead:
         Raises:
             ValueError: if there is no critic.
         """
-        critic = self.critic
-        if critic is None:
-            raise ValueError("the values of placements need a critic of afterstates")
 
         def compute() -> Tensor:
-            afterstates, spec = self.afterstates(game), game.spec
-            count = len(afterstates.volume)
-            rows = torch.arange(-(-count // MULTIPLE) * MULTIPLE, device=game.device)
-            values = [
-                critic.estimate(features(afterstates, game.volume, part.clamp(max=count - 1)))
-                for part in torch.split(rows, AT_ONCE[game.device.type])
-            ]
-            gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
-            reward = (gain - loss) / game.volume
-            value = (reward + torch.cat(values)[:count]) * self.value_share
-            return afterstates.as_map(value.float(), game.mask, ILLEGAL)
+            return self.returns(self.afterstates(game), game.mask, game)
 
-        return self.memo.once(game, ("afterstate_value", critic), compute)
+        return self.memo.once(game, ("afterstate_value", self.critic), compute)
+
+    def after(self, bins: Bins, sides: Tensor, mask: Tensor, game: Packing) -> Afterstates:
+        """Compute the afterstates of placements in any bins of a game's size.
+
+        Args:
+            bins, sides, mask: as for
+                :func:`marl_pack.agents.afterstates.afterstates.afterstates_of`.
+            game: a game with the stream of these bins.
+        """
+        width, depth, _ = bins.size
+        code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
+        return code(bins, sides, mask, probe_lengths(*game.stream.sides))
+
+    def returns(self, afterstates: Afterstates, mask: Tensor, game: Packing) -> Tensor:
+        """Estimate the returns of placements: their reward (Eq. 5) plus the critic's value.
+
+        Args:
+            afterstates: the afterstates of the placements.
+            mask: bool [N, A, W, D], where a placement is legal.
+            game: a game with the volume and the rewards of these placements.
+
+        Returns:
+            Float32 [N, A, W, D]; :data:`ILLEGAL` where the placement is not legal.
+
+        Raises:
+            ValueError: if there is no critic.
+        """
+        spec = game.spec
+        gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
+        value = ((gain - loss) / game.volume + self._estimates(afterstates, game)).float()
+        return afterstates.as_map(value * self.value_share, mask, ILLEGAL)
+
+    def _estimates(self, afterstates: Afterstates, game: Packing) -> Tensor:
+        """Estimate the return that is still to come after each of K placements, float32 [K]."""
+        if self.critic is None:
+            raise ValueError("the values of placements and bins need a critic of afterstates")
+        count, device = len(afterstates.volume), afterstates.volume.device
+        rows = torch.arange(-(-count // MULTIPLE) * MULTIPLE, device=device)
+        values = [
+            self.critic.estimate(features(afterstates, game.volume, part.clamp(max=count - 1)))
+            for part in torch.split(rows, AT_ONCE[device.type])
+        ]
+        return torch.cat(values)[:count]
 
     def state_value(self, bins: Bins, game: Packing) -> Tensor:
         """Estimate the return that is still to come from bins as they are, float32 [N].
@@ -175,23 +203,13 @@ class Lookahead:
         Raises:
             ValueError: if there is no critic.
         """
-        if self.critic is None:
-            raise ValueError("the values of bins need a critic of afterstates")
         width, depth, _ = bins.size
         # A box without height changes nothing, so its afterstate is the bin as it is.
         sides = torch.tensor([[[1, 1, 0]]], dtype=torch.int16, device=bins.device)
         mask = torch.zeros(len(bins), 1, width, depth, dtype=torch.bool, device=bins.device)
         mask[:, :, 0, 0] = True
-        code = afterstates_of if width * depth <= EXACT_CELLS else sampled_afterstates
-        lengths = probe_lengths(*game.stream.sides)
-        after = code(bins, sides.expand(len(bins), 1, 3).contiguous(), mask, lengths)
-        count = len(after.volume)
-        rows = torch.arange(-(-count // MULTIPLE) * MULTIPLE, device=bins.device)
-        values = torch.cat([
-            self.critic.estimate(features(after, game.volume, part.clamp(max=count - 1)))
-            for part in torch.split(rows, AT_ONCE[bins.device.type])
-        ])  # fmt: skip
-        return values[after.index[:, 0, 0, 0]] * self.value_share
+        after = self.after(bins, sides.expand(len(bins), 1, 3).contiguous(), mask, game)
+        return self._estimates(after, game)[after.index[:, 0, 0, 0]] * self.value_share
 
     def heightmap(self, game: Packing) -> Tensor:
         """Return a copy of the heightmaps int16 [G, W, D], which later placements do not change."""

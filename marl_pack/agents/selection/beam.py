@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ GAMES_AT_ONCE = 64
 
 
 @dataclass
-class _Nodes:
+class Nodes:
     """The nodes of a beam."""
 
     games: SelectionPacking  # N games
@@ -41,9 +42,9 @@ class _Nodes:
     gain: Tensor  # float64 [N]   return since the root, plus the change of the values of the bins
     first: Tensor  # int64 [N]    number of the first placement; -1 at the root
 
-    def select(self, which: Tensor) -> _Nodes:
+    def select(self, which: Tensor) -> Nodes:
         """Return some of the nodes, int64 [K]."""
-        return _Nodes(
+        return Nodes(
             self.games.branch(which), self.root[which], self.gain[which], self.first[which]
         )
 
@@ -70,30 +71,42 @@ class Beam:
 
     def _search(self, game: SelectionPacking, games: Tensor) -> Tensor:
         """Return the number of the best placement of some games, int64 [K]."""
-        device, count = game.device, len(games)
-        nodes = _Nodes(
-            game.branch(games, only_known=True), torch.arange(count, device=device),
-            torch.zeros(count, dtype=torch.float64, device=device),
-            torch.full((count,), -1, device=device),
-        )  # fmt: skip
-        best = np.full(count, -np.inf)
-        choice = np.zeros(count, np.int64)
-        depth = self.settings.depth_in(game)
-        for level in range(depth):
-            nodes = self._expand(nodes)
-            finished = nodes.games.state.ended | (level + 1 == depth)
-            ends = finished.nonzero().squeeze(1)
-            value = self._final(nodes.select(ends)).tolist()
-            roots, firsts = nodes.root[ends].tolist(), nodes.first[ends].tolist()
-            for v, root, first in zip(value, roots, firsts, strict=True):
+        best = np.full(len(games), -np.inf)
+        choice = np.zeros(len(games), np.int64)
+        for ends, values in self.ends(game, games):
+            roots, firsts = ends.root.tolist(), ends.first.tolist()
+            for v, root, first in zip(values.tolist(), roots, firsts, strict=True):
                 if v > best[root]:
                     best[root], choice[root] = v, first
+        return torch.from_numpy(choice).to(game.device)
+
+    def ends(
+        self, game: SelectionPacking, games: Tensor, late: Callable[[], bool] = lambda: False
+    ) -> Iterator[tuple[Nodes, Tensor]]:
+        """Search, and yield the nodes that end at each depth, with their values float64 [N].
+
+        Args:
+            game: the games.
+            games: int64 [K], numbers of the games to search in.
+            late: whether to end at this depth; asked before each depth but the first.
+        """
+        count, depth = len(games), self.settings.depth_in(game)
+        nodes = Nodes(
+            game.branch(games, only_known=True), torch.arange(count, device=game.device),
+            torch.zeros(count, dtype=torch.float64, device=game.device),
+            torch.full((count,), -1, device=game.device),
+        )  # fmt: skip
+        for level in range(depth):
+            nodes = self._expand(nodes)
+            last = level + 1 == depth or late()
+            finished = nodes.games.state.ended | last
+            ends = nodes.select(finished.nonzero().squeeze(1))
+            yield ends, self._final(ends)
             nodes = nodes.select((~finished).nonzero().squeeze(1))
             if not len(nodes.root):
                 break
-        return torch.from_numpy(choice).to(device)
 
-    def _expand(self, nodes: _Nodes) -> _Nodes:
+    def _expand(self, nodes: Nodes) -> Nodes:
         """Carry out the best placements of the nodes of each root, and merge equal states."""
         width = self.settings.width
         gain = gains(nodes.games, self.lookahead).flatten(1).double()
@@ -107,10 +120,10 @@ class Beam:
         games = nodes.games.branch(node)
         games.place(*split(games, number), check=False)
         first = torch.where(nodes.first[node] < 0, number, nodes.first[node])
-        after = _Nodes(games, nodes.root[node], score, first)
+        after = Nodes(games, nodes.root[node], score, first)
         return after.select(distinct(after.games, after.root, width))
 
-    def _final(self, nodes: _Nodes) -> Tensor:
+    def _final(self, nodes: Nodes) -> Tensor:
         """Return the value of nodes that end, float64 [N].
 
         A node whose slots are full, and that has no place left, closes its fullest bin, so what was

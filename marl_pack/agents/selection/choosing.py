@@ -13,6 +13,7 @@ from marl_pack.agents.policy import Policy
 from marl_pack.agents.search import Planner
 from marl_pack.agents.selection.beam import Beam
 from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.one_box import OneBoxSearch
 from marl_pack.agents.selection.policies import (
     GreedyValue,
     RandomSelection,
@@ -49,10 +50,14 @@ def selection_policy_of(policy: Policy, search: BeamSettings | None = None) -> S
     if isinstance(policy, SelectFirst):
         policy = policy.policy
     if isinstance(policy, Planner):
-        raise ValueError("search: games with selection need BeamSettings, not SearchSettings")
+        raise ValueError(
+            "search: games with selection need BeamSettings or BudgetSettings, not SearchSettings"
+        )
+    if isinstance(policy, OneBoxSearch):
+        return policy.search
     if any(agent.symmetric for agent in _agents(policy)):
         raise ValueError("symmetric: goes with games of one visible box and one bin")
-    lookahead = _lookahead_of(policy)
+    lookahead = lookahead_of(policy)
     if lookahead is not None:
         return GreedyValue(lookahead) if search is None else Beam(lookahead, search)
     if _is_learned(policy):
@@ -119,7 +124,7 @@ def _is_learned(policy: Any) -> bool:
     return bool(_agents(policy))
 
 
-def _lookahead_of(policy: Any) -> Lookahead | None:
+def lookahead_of(policy: Any) -> Lookahead | None:
     """Return the lookahead of a learned policy; None if its agents have no critic."""
     for agent in _agents(policy):
         lookahead: Lookahead = agent.lookahead
