@@ -8,6 +8,7 @@ import torch
 from small_runs import PLAIN_NETWORK
 from torch import Tensor
 
+from marl_pack import BudgetSettings, SelectionPacking, SelectionSpec, evaluate, load
 from marl_pack.agents import search
 from marl_pack.agents.afterstates.lookahead import Lookahead
 from marl_pack.agents.heuristics import (
@@ -20,8 +21,16 @@ from marl_pack.agents.networks.actor_critic import make_actor, make_critic
 from marl_pack.agents.policy import InTurns, Policy
 from marl_pack.agents.search import Planner
 from marl_pack.agents.search_settings import SearchSettings
+from marl_pack.agents.selection.beam import Beam
+from marl_pack.agents.selection.beam_settings import BeamSettings
+from marl_pack.agents.selection.budget import BudgetSearch
+from marl_pack.agents.selection.choosing import lookahead_of
+from marl_pack.agents.selection.kinds import kinds_of
+from marl_pack.agents.selection.policies import GreedyValue
+from marl_pack.agents.selection.touching import keep_touching
 from marl_pack.evaluation.rollout import play
 from marl_pack.game.packing import Packing
+from marl_pack.game.spec import GameSpec
 from marl_pack.items import Uniform, make_stream
 
 SIZE = (6, 6, 6)
@@ -295,3 +304,166 @@ def test_seeds_of_random_play_are_whole_numbers(seed: Any) -> None:
             make("random", seed)
         make("random", np.int64(4))
         make("random", None)
+
+
+# --- with a time budget ---------------------------------------------------------------------------
+
+ONE_BOX: dict[str, int] = {}
+VARIANTS = [
+    ONE_BOX, {"buffer": 3}, {"preview": 2}, {"bins": 2, "closings": 3}, {"buffer": 2, "preview": 1}
+]  # fmt: skip
+
+
+def selecting(n: int, items: Any = "rs", **options: int) -> SelectionPacking:
+    return SelectionPacking(n, items, spec=SelectionSpec(**options), seed=4)
+
+
+def budget_search(settings: str = "draws=2,width=4", **arguments: Any) -> BudgetSearch:
+    lookahead = lookahead_of(load("rs").policy)
+    assert lookahead is not None
+    boxes = make_stream("rs", (10, 10, 10))
+    return BudgetSearch(lookahead, BudgetSettings.parse(settings), boxes, **arguments)
+
+
+def choices(placement: tuple[Tensor, ...]) -> list[list[int]]:
+    return torch.stack(placement, 1).tolist()
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+def test_hidden_boxes_change_no_choice_of_a_budget_search(options: dict[str, int]) -> None:
+    items = np.random.default_rng(1).integers(2, 6, (2, 40, 3))
+    known = 7 + options.get("buffer", 1) + options.get("preview", 0)
+    items[1, :known] = items[0, :known]
+    game, policy = selecting(2, items, **options), budget_search()
+    for _ in range(8):
+        choice = policy(game)
+        first, second = choices(choice)
+        assert first == second
+        game.place(*choice)
+    again = selecting(2, items, **options)
+    assert choices(policy(again)) == choices(budget_search()(again))
+
+
+def test_a_budget_search_plays_on_with_few_visible_boxes_and_full_bins() -> None:
+    for options in VARIANTS:
+        game, policy = selecting(2, **options), budget_search("draws=1,width=2")
+        while bool(game.alive.any()):
+            game.place(*policy(game))
+        assert (game.utilization > 0.6).all()
+
+
+def test_a_budget_search_is_a_beam_where_everything_is_known() -> None:
+    items = np.random.default_rng(2).integers(2, 6, (6, 4, 3))
+    game = selecting(6, items, preview=5)
+    policy = budget_search("draws=9,width=8")
+    beam = Beam(policy.lookahead, BeamSettings(8))
+    while bool(game.alive.any()):
+        choice = beam(game)
+        assert choices(policy(game)) == choices(choice)
+        game.place(*choice)
+
+
+def test_a_budget_search_finds_more_than_the_critic() -> None:
+    game, plain = selecting(12), selecting(12)
+    policy, greedy = budget_search("draws=4"), GreedyValue(budget_search().lookahead)
+    while bool(game.alive.any()):
+        game.place(*policy(game))
+    while bool(plain.alive.any()):
+        plain.place(*greedy(plain))
+    assert float(game.utilization.mean()) > float(plain.utilization.mean()) + 0.01
+
+
+@pytest.mark.parametrize("options", [ONE_BOX, {"buffer": 4, "preview": 4}])
+def test_a_budget_search_ends_in_time(options: dict[str, int]) -> None:
+    """The clock advances by 1 ms at each look; a search looks at least before each draw."""
+    looks = []
+
+    def clock() -> int:
+        looks.append(len(looks))
+        return 1_000_000 * len(looks)
+
+    game = selecting(1, **options)
+    for budget, most in ((1, 8), (20, 26), (60, 66)):
+        looks.clear()
+        game.place(*budget_search(f"budget={budget}ms", clock=clock)(game))
+        assert len(looks) <= most
+        assert len(looks) >= min(most, 20) - 8 or options
+
+
+def test_a_search_for_one_box_is_the_search_with_selection() -> None:
+    game = Packing(3, seed=4, auto_reset=False)
+    player = load("rs", search=BudgetSettings(draws=2, width=4))
+    other = selecting(3)
+    for _ in range(4):
+        choice, expected = player(game), player(other)
+        assert choices(choice) == choices(expected[1:])
+        game.place(*choice)
+        other.place(*expected)
+    orientation = torch.tensor([2, 2, 2])
+    chosen = player.policy(game, game.moves.only(orientation))  # type: ignore[call-arg]  # a search
+    assert (chosen[0] == orientation)[game.moves.orientations[:, 2]].all()
+
+
+def test_boxes_are_drawn_as_often_as_they_come() -> None:
+    kinds = kinds_of(make_stream("rs", (10, 10, 10)), GameSpec(), -1)
+    assert len(kinds.reached) == 20
+    share = np.diff(kinds.reached, prepend=0)
+    equal = (kinds.items.sides == kinds.items.sides[:, :1]).all(1).numpy()
+    assert share[equal] == pytest.approx(1 / 64, abs=0.006)
+    drawn = np.bincount(kinds.at((np.arange(6400) + 0.5) / 6400), minlength=20) / 6400
+    assert drawn == pytest.approx(share, abs=1e-3)
+    upright = kinds_of(make_stream("rs", (10, 10, 10)), GameSpec(orientations=(0, 1)), -1)
+    assert len(upright.reached) == 64
+
+
+def test_boxes_are_placed_where_they_touch() -> None:
+    game = Packing(40, seed=1, auto_reset=False)
+    policy = make_policy("random", 0)
+    for _ in range(5):
+        sides = game.orient_item(game.items).sides
+        mask = game.mask.clone()
+        keep_touching(game.bins.heightmap.numpy(), sides.numpy(), mask.numpy())
+        for g in game.alive.nonzero().squeeze(1).tolist():
+            level = np.pad(game.bins.heightmap[g].numpy(), 1, constant_values=99)
+            expected = torch.zeros_like(mask[g])
+            for o, x, y in game.mask[g].nonzero().tolist():
+                w, d, _ = sides[g, o].tolist()
+                z = level[x + 1 : x + w + 1, y + 1 : y + d + 1].max()
+                beside = level[[x, x + w + 1], y + 1 : y + d + 1] > z
+                behind = level[x + 1 : x + w + 1][:, [y, y + d + 1]] > z
+                expected[o, x, y] = bool(beside.any() and behind.any())
+            assert torch.equal(mask[g], expected if expected.any() else game.mask[g])
+        game.place(*policy(game))
+
+
+@pytest.mark.parametrize("text", ["budget=100ms", "draws=5", "budget=0.5s,draws=7,width=3"])
+def test_settings_of_a_budget_are_read(text: str) -> None:
+    settings = BudgetSettings.parse(text)
+    assert BudgetSettings.parse(str(settings)) == settings
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("budget=5", "needs budget=100ms"), ("budget=0ms", "more than 0"), ("width=3", "needs a"),
+     ("draws=2,draws=3", "given twice"), ("draws=9999999", "draws"), ("top=3", "needs budget")],
+)  # fmt: skip
+def test_impossible_budgets_are_refused(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        BudgetSettings.parse(text)
+
+
+def test_a_budget_needs_a_critic_of_afterstates_and_centred_boxes() -> None:
+    settings = BudgetSettings(draws=1)
+    with pytest.raises(ValueError, match="need agents with a critic of afterstates"):
+        load("plain", search=settings)
+    with pytest.raises(ValueError, match="does not ask the agents"):
+        load("rs", search=settings, symmetric=True)
+    with pytest.raises(ValueError, match="no com_offset"):
+        load("rs", search=settings)(Packing(1, com_offset=(0.1, 0, 0)))
+
+
+def test_evaluate_plans_with_a_budget(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--policy", "rs", "--items", "rs", "--episodes", "2", "--plan", "draws=1"]
+    for options in ([], ["--buffer", "2"], ["--bins", "2", "--closings", "2"]):
+        assert evaluate.main([*words, *options]) == 0
+        assert "rs, draws=1" in capsys.readouterr().out

@@ -482,7 +482,7 @@ def test_a_loaded_policy_plays_games_with_selection(greedy: GreedyValue) -> None
     with pytest.raises(ValueError, match="need agents with a critic of afterstates"):
         load("plain")(game)
     for source, words in (
-        (load("rs", search=SearchSettings()), "need BeamSettings, not SearchSettings"),
+        (load("rs", search=SearchSettings()), "need BeamSettings or BudgetSettings, not"),
         (load("rs", symmetric=True), "symmetric: goes with games of one visible box"),
     ):
         with pytest.raises(ValueError, match=words):
