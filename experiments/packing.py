@@ -100,6 +100,13 @@ SELECTION = {
         f"--policy {policy} --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"
         for policy in ("rs", "dblf") for b in (1, 2, 3, 4)
     ],
+    "budget": [
+        f"--policy rs {SETS['RS']} --episodes {n} {options}"
+        for options, n in (
+            ("--plan draws=4", 100), ("--plan draws=16", 100),
+            ("--preview 1 --plan draws=8", 50), ("--buffer 3 --plan draws=8", 50),
+        )
+    ],
 }  # fmt: skip
 """Rows of the table ``selection`` by the option that they show."""
 TABLES["selection"] = [row for rows in SELECTION.values() for row in rows]

@@ -68,6 +68,7 @@ def _agents() -> None:
     from marl_pack.agents.learning import checkpoint
     from marl_pack.agents.loading import Loader
     from marl_pack.agents.search_settings import SearchSettings
+    from marl_pack.agents.selection.budget_settings import BudgetSettings
     from marl_pack.game.packing import Packing
     from marl_pack.items import make_stream
 
@@ -77,6 +78,8 @@ def _agents() -> None:
         futures = make_stream("rs", size, sides)
         planner = loader.planner(record, SearchSettings.parse("rollouts=2,top=2,depth=1"), futures)
         _play(Packing(1, size, sides=sides), planner)
+        budget = loader.planner(record, BudgetSettings(draws=1), futures)
+        _play(Packing(1, size, sides=sides), budget)
 
 
 def _environments() -> None:

@@ -137,7 +137,7 @@ class _Futures:
 
         Args:
             value: float64 [C], the values of the candidates so far.
-            start, deadline: time at which the search began and has to end.
+            start, deadline: times at which the search began and has to end.
         """
         clock, draws = self.search.clock, self.search.settings.draws
         count, drawn = len(value), 0
@@ -147,11 +147,16 @@ class _Futures:
             until = deadline if k == rounds else start + (deadline - start) * k / rounds
             most = math.inf if draws is None else max(1, round(draws * count / rounds / len(left)))
             played = 0
-            while played < most and (not drawn or clock() + cost <= until):
-                begin, n = clock(), int(min(most - played, max(1, ROWS // len(left))))
+            while played < most:
+                begin = clock()
+                # Nothing is known of the time for the first draw, which is made in any case.
+                in_time = (until - begin) / cost / len(left) if drawn else 1
+                n = int(min(most - played, max(1, ROWS // len(left)), in_time))
+                if n < 1:
+                    break
                 total[left] += self._play(left, drawn, n).sum(1)
                 played, drawn = played + n, drawn + n
-                cost = clock() - begin
+                cost = max(1.0, clock() - begin) / (n * len(left))
             mean[left] = total[left] / drawn
             if k < rounds:
                 order = np.argsort(-(value + mean)[left], kind="stable")

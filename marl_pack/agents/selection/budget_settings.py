@@ -36,7 +36,7 @@ class BudgetSettings:
             if not 0 < budget <= 1e9:
                 raise ValueError(f"budget {budget:g} ms: needs more than 0 ms, at most 1e9 ms")
         if self.draws is not None:
-            whole_number(self.draws, "draws", 0, MOST_DRAWS)
+            whole_number(self.draws, "draws", 1, MOST_DRAWS)
         whole_number(self.width, "width", 1, MOST_WIDTH)
 
     def __str__(self) -> str:
