@@ -142,15 +142,16 @@ class _Futures:
         clock, draws = self.search.clock, self.search.settings.draws
         count, drawn = len(value), 0
         total, mean, left = np.zeros(count), np.zeros(count), np.arange(count)
-        rounds, cost = max(1, math.ceil(math.log2(count))), 0.0
+        rounds, cost = max(1, math.ceil(math.log2(count))), 1.0
         for k in range(1, rounds + 1):
             until = deadline if k == rounds else start + (deadline - start) * k / rounds
             most = math.inf if draws is None else max(1, round(draws * count / rounds / len(left)))
             played = 0
             while played < most:
                 begin = clock()
-                # Nothing is known of the time for the first draw, which is made in any case.
-                in_time = (until - begin) / cost / len(left) if drawn else 1
+                in_time = (until - begin) / cost / len(left)
+                if not drawn:  # one draw is made in any case, and shows how long a draw takes
+                    in_time = max(1, in_time) if math.isinf(deadline) else 1
                 n = int(min(most - played, max(1, ROWS // len(left)), in_time))
                 if n < 1:
                     break
