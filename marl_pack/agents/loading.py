@@ -245,7 +245,7 @@ class Loader:
             raise ValueError(
                 "plan: a budget or draws need agents with a critic of afterstates, such as rs"
             )
-        return BudgetSearch(lookahead, settings, futures, self.seed or 0)
+        return BudgetSearch(lookahead, settings, futures, seed=self.seed or 0)
 
 
 def imagined_stream(

@@ -178,8 +178,9 @@ class Lookahead:
         """
         spec = game.spec
         gain, loss = spec.alpha * afterstates.volume, spec.beta * afterstates.waste
-        value = ((gain - loss) / game.volume + self._estimates(afterstates, game)).float()
-        return afterstates.as_map(value * self.value_share, mask, ILLEGAL)
+        reward = (gain - loss) / game.volume
+        value = (reward + self._estimates(afterstates, game)) * self.value_share
+        return afterstates.as_map(value.float(), mask, ILLEGAL)
 
     def _estimates(self, afterstates: Afterstates, game: Packing) -> Tensor:
         """Estimate the return that is still to come after each of K placements, float32 [K]."""
