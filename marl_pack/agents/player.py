@@ -76,7 +76,7 @@ def load(
         return Player(loader.policy(source), search)
     if not isinstance(search, SearchSettings | BudgetSettings):
         raise ValueError(
-            f"search = {shown(search)}: needs BudgetSettings, SearchSettings or BeamSettings"
+            f"search = {shown(search)}: needs SearchSettings, BeamSettings or BudgetSettings"
         )
     checkpoint = checkpoints.read(source, device)
     try:
