@@ -90,8 +90,8 @@ def draw(measured: list[Point], picture: Path) -> None:
             seen_boxes = p.preview or p.buffer
             time.annotate(f" {seen_boxes}", (p.ms, p.utilization), fontsize="small")
     time.set_xscale("log")
-    time.set_xlabel("ms of CPU time a decision (policy rs; numbers: boxes of the option)")
-    time.legend()
+    time.set_xlabel("ms of CPU time a decision, by rs; the numbers are k and p")
+    time.legend(loc="lower center")
     for panel in panels.flat:
         panel.set_ylabel("utilization, %")
         panel.grid(alpha=0.3)

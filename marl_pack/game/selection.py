@@ -513,6 +513,22 @@ class SelectionPacking(Copied):
             except ValueError as error:
                 raise ValueError(f"state of another game: {error}") from None
 
+    def like(self, game: Packing, moves: Moves) -> Self:
+        """Return copies of games of one box and one bin as games with selection, of one option.
+
+        Args:
+            game: the games, with the options and the stream of these.
+            moves: the legal placements.
+        """
+        copies = self.branch(torch.zeros(game.n, dtype=torch.int64, device=self.device))
+        state, new = game.state, copies.state
+        new.bins, new.slots, new.t = state.bins.clone(), state.t[:, None], state.t + 1
+        new.episode, new.stream, new.ended = state.episode, state.stream, ~game.alive
+        new.packed, new.placed = state.bins.filled.clone(), state.bins.count.clone()
+        new.mask = moves.mask[:, None].clone()
+        copies._find(copies._games[:0])
+        return copies
+
     def branch(self, games: Tensor, *, only_known: bool = False) -> Self:
         """Return games that begin as copies of some of these and are then played independently.
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-import torch
-
 from marl_pack.agents.policy import Placement
 from marl_pack.agents.selection.budget import BudgetSearch
 from marl_pack.game.moves import Moves
@@ -51,11 +49,4 @@ class OneBoxSearch:
                 1, game.stream, spec=SelectionSpec(**options), device=game.device,
                 backend=game.backend,
             )  # fmt: skip
-        selecting = last.branch(torch.zeros(game.n, dtype=torch.int64, device=game.device))
-        state, new = game.state, selecting.state
-        new.bins, new.slots, new.t = state.bins.clone(), state.t[:, None], state.t + 1
-        new.episode, new.stream, new.ended = state.episode, state.stream, ~game.alive
-        new.packed, new.placed = state.bins.filled.clone(), state.bins.count.clone()
-        new.mask = moves.mask[:, None].clone()
-        selecting._find(selecting._games[:0])
-        return selecting
+        return last.like(game, moves)
