@@ -199,6 +199,10 @@ class Options(Arguments, SelectionOptions, total=False):
     """The keyword arguments of :func:`env`; its signature has their defaults."""
 
 
+OPTIONS = frozenset(Options.__optional_keys__)
+"""Names of the keyword arguments of the environments on cells."""
+
+
 @overload
 def env(
     *, world: Literal["cells"] = ..., illegal_reward: float = ..., **options: Unpack[Options]
@@ -225,12 +229,15 @@ def env(*, world: str = "cells", illegal_reward: float = -1.0, **options: Any) -
 def _make(world: str, illegal_reward: float, options: Mapping[str, Any]) -> AECEnv:
     """Return the environment of a world in PettingZoo's usual wrappers."""
     one_of("world", world, WORLDS)
+    added = {name: options[name] for name in added_options() if name in options}
     if world == "mm":
         from marl_pack import env_mm
 
+        if added:
+            raise ValueError(f"{', '.join(added)}: needs world = 'cells'")
         return wrap(env_mm.raw_env(**options), illegal_reward)
-    added = {name: options[name] for name in added_options() if name in options}
-    if SelectionSpec(**added).selects:
+    unknown = {name: value for name, value in options.items() if name not in OPTIONS}
+    if SelectionSpec().with_options(unknown | added, TAKEN).selects:
         from marl_pack import env_selection
 
         return wrap(env_selection.raw_env(**options), illegal_reward)
@@ -338,6 +345,11 @@ class raw_env(CellEnv):  # noqa: N801  # PettingZoo's name for it
         illegal: str = "terminate",
         **options: Unpack[GameOptions],
     ) -> None:
+        if several := [name for name in added_options() if name in options]:
+            raise TypeError(
+                f"{', '.join(several)}: raw_env has one visible box and one bin; use "
+                "env_aec.env or env_selection.raw_env"
+            )
         self._spec = GameSpec(bin=bin_size).with_options(options, TAKEN)
         self._all_masked = self._spec.mask_orientations  # an orientation chosen has a legal cell
         game = Packing(1, items=items, spec=self._spec, sides=sides, auto_reset=False)

@@ -86,12 +86,19 @@ class Feed:
                 lambda: self.packer.skip(arrival.sides, **box),
             )
             return
+        yield from self._possible()  # a run that was killed may have left some
+        if self.stopped:
+            return
         answer = self.packer.show(arrival.sides, **box)
         if isinstance(answer, Waiting):
             self.lines[answer.number] = line
             yield answer
         else:
             yield self._timed(lambda: answer, lambda: self.packer.skip(arrival.sides, **box))
+        yield from self._possible()
+
+    def _possible(self) -> Iterator[Placement | NoPlace]:
+        """Yield the answers that need no further box."""
         while not self.stopped and not self.packer.needs_box:
             yield self._next()
 

@@ -82,8 +82,13 @@ def test_without_a_variant_it_is_the_papers_environment() -> None:
     assert isinstance(env.unwrapped, env_aec.raw_env)
     with pytest.raises(ValueError, match="buffer: needs a whole number from 1 to 64, not 0"):
         env_aec.env(buffer=0)
-    with pytest.raises(TypeError, match="unexpected option 'bufer'; did you mean 'buffer'"):
-        env_aec.env(bufer=3, bins=2)
+    for more in ({}, {"bins": 2}):
+        with pytest.raises(TypeError, match=r"unexpected option 'bufer'; did you mean 'buffer'\?"):
+            env_aec.env(bufer=3, **more)
+    with pytest.raises(TypeError, match=r"buffer: raw_env has one visible box .* use env_aec.env"):
+        env_aec.raw_env(buffer=3)
+    with pytest.raises(ValueError, match="buffer: needs world = 'cells'"):
+        env_aec.env(world="mm", items=[[300, 200, 100]], buffer=3)
 
 
 def test_with_one_box_and_one_bin_it_is_the_papers_game_action_by_action() -> None:

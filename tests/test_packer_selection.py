@@ -21,6 +21,7 @@ from marl_pack.exact.options import Options
 from marl_pack.exact.policies import HEURISTICS, TUNED, read_weights
 from marl_pack.exact.search import Search, _Trial
 from marl_pack.exact.search_settings import ExactSearchSettings
+from marl_pack.feed import Feed
 from marl_pack.packer.answers import NoPlace, Placement, Waiting
 from marl_pack.packer.calls import goods_of
 from marl_pack.packer.packer import Packer
@@ -450,3 +451,23 @@ def test_a_conveyor_that_is_stopped_loses_no_box_that_waits(
         waits.number: None for waits in kept.waiting
     }
     assert Packer.restore(state).waiting == ()
+
+
+def test_a_run_that_was_killed_decides_before_it_shows_the_next_box(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = tmp_path / "state.json"
+    options = ["-", "--bin-mm", "600", "400", "400", "--buffer", "2", "--state", str(state)]
+    boxes = [{"id": name, "w_mm": 300, "d_mm": 200, "h_mm": 200} for name in "abc"]
+    box_lines = [json.dumps(box) + "\n" for box in boxes]
+    monkeypatch.setattr("sys.stdin", io.StringIO("".join(box_lines[:2])))
+    with monkeypatch.context() as killed:  # after the second box has been shown
+        killed.setattr(Feed, "_possible", lambda self: iter(()))
+        killed.setattr(Feed, "rest", lambda self: iter(()))
+        assert pack.main(options) == 0
+    capsys.readouterr()
+    monkeypatch.setattr("sys.stdin", io.StringIO(box_lines[2]))
+    assert pack.main(options) == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [answer.get("placed") for answer in answers] == [True, None, True, True]
+    assert {answer["id"] for answer in answers if "placed" in answer} == {"a", "b", "c"}

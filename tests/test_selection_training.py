@@ -242,6 +242,7 @@ def test_a_changed_state_of_the_game_is_refused() -> None:
         ("episode", lambda v: v + 2**63 - 5, "episode"),
         ("t", lambda v: v + 1, "t of game 0"),
         ("t", lambda v: v[:1], "the numbers of 2 games"),
+        ("episode", lambda v: "x", "needs tensors"),
         ("seed", lambda v: v + 1, "needs the seed of this game"),
     ):
         with pytest.raises(ValueError, match=why):
@@ -326,6 +327,35 @@ def test_a_run_with_a_selection_agent_begins_with_a_model_without_one() -> None:
     runner.begin_with(checkpoint)
     critic = runner.alg.afterstates.critic.state_dict()
     assert same(critic, checkpoint["afterstate_critic"])
+
+
+def test_an_agent_that_was_frozen_there_begins_with_new_weights() -> None:
+    game = "--game.buffer=2"
+    frozen = make_runner(tiny(game, "--selection.frozen=true", "--selection.policy=first"), None)
+    runner = make_runner(tiny(game), None)
+    before = weights(runner, SELECTION)
+    runner.begin_with(frozen.checkpoint())
+    assert same(before, weights(runner, SELECTION))
+
+
+def test_the_critic_learns_whatever_share_of_it_the_agents_observe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    runner = make_runner(tiny("--game.buffer=2", "--ppo.afterstate_ramp=[5,9]"), None)
+    assert runner.alg.lookahead.value_share == 0
+    seen = []
+    targets = BinReturns.targets
+
+    def spied(own: BinReturns, values: torch.Tensor, gamma: float) -> torch.Tensor:
+        seen.append(values)
+        return targets(own, values, gamma)
+
+    monkeypatch.setattr(BinReturns, "targets", spied)
+    torch.nn.init.constant_(runner.alg.afterstates.critic.layers[-1].bias, 0.5)
+    with torch.inference_mode():
+        runner.alg.compute_returns(rollout(runner))
+    runner.alg.update()
+    assert (seen[0] - 0.5).abs().max() < 0.2
 
 
 def test_export_leaves_the_selection_agent_out(tmp_path: Path) -> None:

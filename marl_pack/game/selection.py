@@ -479,8 +479,10 @@ class SelectionPacking(Copied):
                 not changed then.
         """
         tensors = without_origin(tensors, origin(self.stream, self.spec, self.seed))
-        if set(tensors) != {"episode", "choices", "t"}:
-            raise ValueError("state of another game: needs episode, choices and t")
+        if set(tensors) != {"episode", "choices", "t"} or not all(
+            isinstance(tensor, Tensor) for tensor in tensors.values()
+        ):
+            raise ValueError("state of another game: needs tensors episode, choices and t")
         episode, choices, t = tensors["episode"], tensors["choices"], tensors["t"]
         whole = episode.dtype == t.dtype == torch.int64 and choices.dtype == torch.int32
         if not whole or choices.dim() != 3 or (episode.shape, t.shape, choices.shape[::2]) != (

@@ -25,7 +25,7 @@ class Placement:
     # nothing carries the box
     yaw: float = 0.0  # rotation about the vertical, degrees; only if the robot reported it
     problem: str = ""  # why a reported pose breaks the rule; "" if it does not
-    number: int | None = None  # which box it is, if the box was shown: 0 for the first one
+    number: int | None = None  # of the box if it was shown: the boxes that came before it
 
     placed: Literal[True] = True
 
@@ -53,7 +53,7 @@ class NoPlace:
     id: str
     code: str  # a key of REASONS
     reason: str  # one sentence
-    number: int | None = None  # which box it is, if the box was shown: 0 for the first one
+    number: int | None = None  # of the box if it was shown: the boxes that came before it
 
     placed: Literal[False] = False
 
@@ -70,7 +70,7 @@ class NoPlace:
 class Waiting:
     """A box that was shown and is not placed yet; it is true in a condition."""
 
-    number: int  # 0 for the first box that was shown
+    number: int  # of the boxes that came before it, those that were placed or left out included
     id: str  # "" where unknown
     sides: tuple[float, float, float]  # own sides w, d, h in millimetres
     order: str  # name of its order; "" for none

@@ -80,7 +80,7 @@ class Shown:
 class PlacedNext:
     """A visible box was placed by a move."""
 
-    number: int  # of the box, 0 for the first one
+    number: int  # of the box: the boxes that came before it
     bin: int
     move: int
     explanation: Explanation | None = None

@@ -28,7 +28,7 @@ class Known:
 
     item: Goods  # one row
     order: str  # name of its order; "" for none
-    number: int | None = None  # 0 for the first box that was shown; None if it was not shown
+    number: int | None = None  # the boxes that came before it; None if it was not shown
 
     def waiting(self, unit_mm: float) -> Waiting:
         """Return the box for users; it was shown."""

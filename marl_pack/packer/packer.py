@@ -192,8 +192,7 @@ class Packer(Journal):
 
         Args:
             sides: the box's own sides w, d, h in millimetres.
-            order: name of its order. A box of another order than the boxes in the open bin gets a
-                place in the next bin only.
+            order: name of its order. A box gets no place beside boxes of another order.
             **attributes: ``id`` (a text or a number), ``weight`` (kilograms), ``upright`` (whether
                 it may not be tipped), ``orientations`` (a list of 0 … 5), ``stackable`` (whether
                 anything may rest on it) and ``max_load`` (kilograms of all boxes above it).
@@ -234,7 +233,7 @@ class Packer(Journal):
             sides, order, attributes: the box, as for :meth:`place`.
 
         Returns:
-            The box with its number, 0 for the first one; or
+            The box with its number, the count of boxes that came before it; or
             :class:`marl_pack.packer.answers.NoPlace` if it has no place in an empty bin, and then
             nothing has changed: :meth:`skip` records it.
 

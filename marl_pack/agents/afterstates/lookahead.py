@@ -197,6 +197,8 @@ class Lookahead:
     def state_value(self, bins: Bins, game: Packing) -> Tensor:
         """Estimate the return that is still to come from bins as they are, float32 [N].
 
+        Like the values of placements, it is multiplied by :attr:`value_share`.
+
         Args:
             bins: N bins.
             game: a game with the stream of these bins.
@@ -204,13 +206,17 @@ class Lookahead:
         Raises:
             ValueError: if there is no critic.
         """
+        return self.expected(bins, game) * self.value_share
+
+    def expected(self, bins: Bins, game: Packing) -> Tensor:
+        """Estimate the return as :meth:`state_value` does, whatever share of it agents observe."""
         width, depth, _ = bins.size
         # A box without height changes nothing, so its afterstate is the bin as it is.
         sides = torch.tensor([[[1, 1, 0]]], dtype=torch.int16, device=bins.device)
         mask = torch.zeros(len(bins), 1, width, depth, dtype=torch.bool, device=bins.device)
         mask[:, :, 0, 0] = True
         after = self.after(bins, sides.expand(len(bins), 1, 3).contiguous(), mask, game)
-        return self._estimates(after, game)[after.index[:, 0, 0, 0]] * self.value_share
+        return self._estimates(after, game)[after.index[:, 0, 0, 0]]
 
     def heightmap(self, game: Packing) -> Tensor:
         """Return a copy of the heightmaps int16 [G, W, D], which later placements do not change."""

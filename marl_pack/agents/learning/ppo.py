@@ -25,7 +25,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from marl_pack.agents.afterstates.critic import AfterstateCritic, AfterstateLearner
-from marl_pack.agents.afterstates.gains import values_before
 from marl_pack.agents.afterstates.lookahead import Lookahead, value_share_at
 from marl_pack.agents.learning.bin_returns import BinReturns
 from marl_pack.agents.learning.cloning import Teacher
@@ -311,8 +310,8 @@ class PackingPPO:
         if self.bin_returns is not None:
             assert isinstance(game, SelectionPacking), "only these games have several bins"
             with torch.inference_mode():
-                open_bins = values_before(game, self.lookahead)[:, : game.b]
-            targets = self.bin_returns.targets(open_bins, ppo.gamma)
+                coming = self.lookahead.expected(game.bins, game.view()).view(game.n, game.b)
+            targets = self.bin_returns.targets(coming, ppo.gamma)
         else:
             targets = (storage.returns - storage.rewards).squeeze(-1)
         return learner.learn(targets, ppo.learning_rate, processes)

@@ -261,8 +261,8 @@ class Runner(OnPolicyRunner):
         """
         for name, ppo in self.alg.learners.items():
             agent = checkpoint["agents"].get(name, {})
-            if name == SELECTION and name not in checkpoint["agents"]:
-                continue  # it was trained without one: the agent keeps its new weights
+            if name == SELECTION and "critic_state_dict" not in agent:
+                continue  # none has learned there: the agent keeps its new weights
             if "critic_state_dict" not in agent or "network" not in agent:
                 raise ValueError(f"init: the checkpoint has no {name} agent that has learned")
             try:
