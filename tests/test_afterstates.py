@@ -196,6 +196,21 @@ def test_the_critic_learns_at_the_first_learners_learning_rate() -> None:
     assert same(before, alg.afterstates.critic.state_dict())
 
 
+def test_the_critic_learns_what_comes_after_a_reward(monkeypatch: pytest.MonkeyPatch) -> None:
+    runner = small_runner(None, *BOTH_SEE_VALUES)
+    storage, seen = next(iter(runner.alg.learners.values())).storage, []
+
+    def spied(own: AfterstateLearner, targets: Tensor, *rest: float) -> float:
+        seen.append((targets, (storage.returns - storage.rewards).squeeze(-1).clone()))
+        return 0.0
+
+    monkeypatch.setattr(AfterstateLearner, "learn", spied)
+    runner.train(1)
+    [(targets, expected)] = seen
+    assert torch.equal(targets, expected)
+    assert bool((storage.rewards != 0).any())
+
+
 def test_a_choice_without_a_legal_cell_is_not_learned_from() -> None:
     game = Packing(16, (4, 4, 4), sides=(1, 4), seed=2, mask_orientations=False)
     critic = AfterstateCritic()

@@ -130,7 +130,7 @@ def changed_value(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
 
 @pytest.mark.parametrize(("change", "message"), [
     (lambda c: c["agents"].update({"../../EVIL": c["agents"]["placement"]}),
-     r"agents: '\.\./\.\./EVIL' is none of orientation, placement, joint"),
+     r"agents: '\.\./\.\./EVIL' is none of selection, orientation, placement, joint"),
     (changed_value("agents/placement", {"name": "\x1b[2Jnobody"}),
      r"agents\.placement\.name: a text with control characters, '\\x1b\[2Jnobody'"),
     (changed_value("agents/placement", {"name": "nobody"}), r"'nobody' is none of dblf"),
