@@ -1,4 +1,4 @@
-"""Measure what a buffer, a preview and several open bins are worth in millimetres.
+"""Measure what a buffer, a preview and several open bins gain in millimetres.
 
 ``python -m experiments.packer_selection``. The goods, the rule and the bins are those of
 :mod:`experiments.packer`. ``buffer`` rows pack one bin until no visible box has a place.

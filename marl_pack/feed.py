@@ -207,7 +207,7 @@ def _answer(
 
 
 def _write(output: TextIO, content: dict[str, Any]) -> None:
-    """Write one answer."""
+    """Write one answer as a line of JSON."""
     output.write(json.dumps(content) + "\n")
     output.flush()
 

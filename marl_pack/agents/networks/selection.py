@@ -217,5 +217,5 @@ class SelectionCritic(MLPModel):
     def get_latent(
         self, obs: Observation, masks: Tensor | None = None, hidden_state: None = None
     ) -> Observation:
-        """Return the observation."""
+        """Return the observation as it is, for the network."""
         return obs
