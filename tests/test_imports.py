@@ -10,8 +10,7 @@ PACKAGE = ROOT / "marl_pack"
 # A module may import from its own layer and from those before it.
 LAYERS = (
     ("backend", "checks", "extras", "files", "inputs", "installation", "option_record", "published",
-     "renamed",
-     "terminal"),
+     "renamed", "settings_text", "terminal"),
     ("geometry",),
     ("bins", "explanation", "items", "plan", "plan_archive", "plan_columns", "render"),
     ("stability", "sapien_check"),
@@ -37,7 +36,8 @@ ONLY = {
     "env_mm": {"checks", "env_turns", "exact", "geometry", "option_record", "plan", "render"},
     "env_turns": {"checks", "game"},
     "exact": {"checks", "exact", "explanation", "extras", "geometry", "inputs", "installation",
-              "items", "option_record", "plan", "renamed", "sapien_check", "stability"},
+              "items", "option_record", "plan", "renamed", "sapien_check", "settings_text",
+              "stability"},
     "game": {"backend", "bins", "checks", "game", "geometry", "installation", "items", "plan",
              "option_record", "renamed", "stability"},
     "render": {"bins", "extras", "files", "geometry", "plan", "render"},

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 from marl_pack.checks import whole_number
+from marl_pack.settings_text import count, settings_in
 
 MOST = 1 << 20
 """Largest number of futures in one decision."""
@@ -44,13 +44,5 @@ class SearchSettings:
         Raises:
             ValueError: if the text has another form; the message says which form is needed.
         """
-        values = {}
-        for part in text.split(","):
-            key, _, value = part.partition("=")
-            key, value = key.strip(), value.strip()
-            if key not in cls.__dataclass_fields__ or not re.fullmatch("[0-9]{1,9}", value):
-                raise ValueError(f"plan {text!r}: {part!r}: needs rollouts=K, top=M or depth=D")
-            if key in values:
-                raise ValueError(f"plan {text!r}: {key} is given twice")
-            values[key] = int(value)
-        return cls(**values)
+        readers = dict.fromkeys(("rollouts", "top", "depth"), count)
+        return cls(**settings_in(text, readers, "needs rollouts=K, top=M or depth=D"))

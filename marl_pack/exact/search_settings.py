@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
-from marl_pack.checks import real_number, whole_number
+from marl_pack.checks import whole_number
+from marl_pack.settings_text import check_budget, count, milliseconds, settings_in
 
 MOST_TOP = 256
 """Largest number of moves to try."""
@@ -31,9 +31,7 @@ class ExactSearchSettings:
     futures: int | None = None
 
     def __post_init__(self) -> None:
-        budget = real_number(self.budget_ms, "budget")
-        if not 0 < budget <= 1e9:
-            raise ValueError(f"budget {budget:g} ms: needs more than 0 ms, at most 1e9 ms")
+        check_budget(self.budget_ms)
         whole_number(self.top, "top", 1, MOST_TOP)
         if self.futures is not None:
             whole_number(self.futures, "futures", 1, 1 << 20)
@@ -57,16 +55,5 @@ class ExactSearchSettings:
         Raises:
             ValueError: if the text has another form; the message says which form is needed.
         """
-        values: dict[str, float | int] = {}
-        for part in text.split(","):
-            key, _, value = (word.strip() for word in part.partition("="))
-            name = "budget_ms" if key == "budget" else key
-            if name in values:
-                raise ValueError(f"plan {text!r}: {key} is given twice")
-            if key == "budget" and (match := re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)(ms|s)", value)):
-                values[name] = float(match[1]) * (1000 if match[2] == "s" else 1)
-            elif key in ("top", "futures") and re.fullmatch("[0-9]{1,9}", value):
-                values[name] = int(value)
-            else:
-                raise ValueError(f"plan {text!r}: {part!r}: {NEEDS}")
-        return cls(**values)  # type: ignore[arg-type]  # the keys are those of the settings
+        values = settings_in(text, {"budget": milliseconds, "top": count, "futures": count}, NEEDS)
+        return cls(values.pop("budget", cls.budget_ms), **values)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from marl_pack.checks import whole_number
+from marl_pack.settings_text import count, settings_in
 
 if TYPE_CHECKING:
     from marl_pack.game.selection import SelectionPacking
@@ -50,10 +50,4 @@ class BeamSettings:
         Raises:
             ValueError: if the text has another form; the message says which form is needed.
         """
-        values: dict[str, int] = {}
-        for part in text.split(","):
-            match = re.fullmatch(r"\s*(width|depth)\s*=\s*([0-9]{1,9})\s*", part)
-            if match is None or match[1] in values:
-                raise ValueError(f"plan {text!r}: {part!r}: {NEEDS}")
-            values[match[1]] = int(match[2])
-        return cls(**values)
+        return cls(**settings_in(text, {"width": count, "depth": count}, NEEDS))

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass
 
 from marl_pack.agents.selection.beam_settings import MOST_WIDTH
-from marl_pack.checks import real_number, whole_number
+from marl_pack.checks import whole_number
+from marl_pack.settings_text import check_budget, count, milliseconds, settings_in
 
 MOST_DRAWS = 1 << 20
 """Largest number of draws in one decision."""
@@ -32,9 +33,7 @@ class BudgetSettings:
         if self.budget_ms is None and self.draws is None:
             raise ValueError("plan: needs a budget, a number of draws, or both")
         if self.budget_ms is not None:
-            budget = real_number(self.budget_ms, "budget")
-            if not 0 < budget <= 1e9:
-                raise ValueError(f"budget {budget:g} ms: needs more than 0 ms, at most 1e9 ms")
+            check_budget(self.budget_ms)
         if self.draws is not None:
             whole_number(self.draws, "draws", 1, MOST_DRAWS)
         whole_number(self.width, "width", 1, MOST_WIDTH)
@@ -56,16 +55,6 @@ class BudgetSettings:
         Raises:
             ValueError: if the text has another form; the message says which form is needed.
         """
-        values: dict[str, float | int] = {}
-        for part in text.split(","):
-            key, _, value = (word.strip() for word in part.partition("="))
-            name = "budget_ms" if key == "budget" else key
-            if name in values:
-                raise ValueError(f"plan {text!r}: {key} is given twice")
-            if key == "budget" and (match := re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)(ms|s)", value)):
-                values[name] = float(match[1]) * (1000 if match[2] == "s" else 1)
-            elif key in ("draws", "width") and re.fullmatch("[0-9]{1,9}", value):
-                values[name] = int(value)
-            else:
-                raise ValueError(f"plan {text!r}: {part!r}: {NEEDS}")
-        return cls(**values)  # type: ignore[arg-type]  # the keys are those of the settings
+        readers = {"budget": milliseconds, "draws": count, "width": count}
+        values = settings_in(text, readers, NEEDS)
+        return cls(values.pop("budget", None), **values)
