@@ -13,6 +13,7 @@ from fuzz.program import (
     games,
     millimetres,
     packers,
+    selection,
     service,
 )
 
@@ -26,6 +27,12 @@ def test_wrong_arguments_are_refused_in_one_line_or_right(tmp_path: Path) -> Non
 def test_random_games_equal_plain_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARL_PACK_CHECK", "1")
     for name, case in islice(games(seed=3, folder=tmp_path), 8):
+        outcome, detail = attempt(case)
+        assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
+
+
+def test_random_games_with_selection_are_equal_in_both_backends(tmp_path: Path) -> None:
+    for name, case in islice(selection(seed=6, folder=tmp_path), 12):
         outcome, detail = attempt(case)
         assert outcome in (REFUSED, RIGHT), f"{name}: {detail}"
 

@@ -66,6 +66,13 @@ def games(seed: int, folder: Path) -> Iterator[Case]:
     yield from cases(seed)
 
 
+def selection(seed: int, folder: Path) -> Iterator[Case]:
+    """Yield games with a buffer, a preview and several bins, played by both backends."""
+    from .selection import cases
+
+    yield from cases(seed)
+
+
 def hull_rules(seed: int, folder: Path) -> Iterator[Case]:
     """Yield windows at the edge of support, a thousand a case."""
     from .exact_stability import check_hulls
@@ -190,8 +197,8 @@ def checkpoints(seed: int, folder: Path) -> Iterator[Case]:
 SOURCES: dict[str, Callable[[int, Path], Iterator[Case]]] = {
     source.__name__: source
     for source in (
-        arguments, settings, item_files, plan_files, checkpoints, games, millimetres, packers,
-        service, hull_rules, equilibria,
+        arguments, settings, item_files, plan_files, checkpoints, games, selection, millimetres,
+        packers, service, hull_rules, equilibria,
     )
 }  # fmt: skip
 
