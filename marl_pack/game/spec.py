@@ -91,7 +91,7 @@ MOST_VISIBLE, MOST_BINS, CLOSINGS = 64, 16, 20
 def _closings(value: Any) -> int | None:
     if value is None:
         return None
-    return whole_number(value, "closings (null for the default)", 1, 10**6)
+    return whole_number(value, "closings", 1, 10**6)
 
 
 def _rule_name(rule: Any) -> str:

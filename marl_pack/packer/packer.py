@@ -376,6 +376,8 @@ class Packer(Journal):
             ValueError: if it is impossible.
         """
         if isinstance(call, Placed):
+            if self._selects:
+                raise ValueError("place: with a buffer or a preview, a box has to be shown first")
             item = self._fitting(call.item)
             self._bins.place(item, call.order, call.bin, call.move, None, call.explanation)
             self._shown.append(item)
