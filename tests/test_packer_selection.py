@@ -381,7 +381,7 @@ def test_calls_that_make_no_sense_are_refused_with_what_would_be_right(tmp_path:
     del last["number"]
     saved["calls"].append({**last, "call": "place", "box": first["box"], "order": ""})
     path.write_text(json.dumps(saved))
-    with pytest.raises(ValueError, match="a box has to be shown first"):
+    with pytest.raises(ValueError, match="each box has to be shown first"):
         Packer.restore(path)
     with pytest.raises(ValueError, match="needs one for each option"):
         list(feed(packer_of((2, 0, 1), lambda turn: np.array([NOWHERE])), boxes(1, 3)))

@@ -377,7 +377,7 @@ class Packer(Journal):
         """
         if isinstance(call, Placed):
             if self._selects:
-                raise ValueError("place: with a buffer or a preview, a box has to be shown first")
+                raise ValueError("place: while boxes are shown, each box has to be shown first")
             item = self._fitting(call.item)
             self._bins.place(item, call.order, call.bin, call.move, None, call.explanation)
             self._shown.append(item)

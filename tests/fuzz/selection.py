@@ -11,6 +11,7 @@ import torch
 from marl_pack.agents.heuristics import make_policy
 from marl_pack.agents.keys import POLICIES
 from marl_pack.agents.selection.choosing import selection_policy_of
+from marl_pack.agents.selection.policies import SelectionPolicy
 from marl_pack.backend import Backend
 from marl_pack.evaluation.statistics import strict_equilibrium
 from marl_pack.game.selection import SelectionPacking
@@ -49,29 +50,48 @@ def play(policy: str, chosen: dict[str, Any]) -> str:
     made = {name: chosen.pop(name) for name in ("items", "sides", "seed") if name in chosen}
     spec = SelectionSpec(**chosen)
     player = selection_policy_of(make_policy(policy, seed=1))
-    restarting = SelectionPacking(2, spec=spec, auto_reset=True, **made)
     both = [SelectionPacking(2, spec=spec, backend=backend, **made) for backend in Backend]
-    for turn in range(TURNS):
-        restarting.place(*player(restarting))
-        if turn == TURNS // 2:
-            restarting.load_state_dict(restarting.state_dict())
-        if not bool(both[0].alive.any()):
-            break
-        choice = player(both[0])
-        for game in both:
-            game.place(*choice)
-        check(*both)
+    restarting = [SelectionPacking(2, spec=spec, auto_reset=True, **made) for _ in range(2)]
+    try:
+        _play(player, both, restarting)
+    except ValueError as error:  # only options may be refused
+        raise AssertionError(f"refused in the middle of a game: {error}") from error
     if chosen["rule"] in BALANCED and chosen.get("margin") is None:
         assert all(strict_equilibrium(plan) for plan in both[0].plans())
     return "right"
 
 
-def check(game: SelectionPacking, other: SelectionPacking) -> None:
-    """Check what holds in every turn, and that two games with the same choices are equal."""
-    assert torch.equal(game.state.mask, other.state.mask)
+def _play(
+    player: SelectionPolicy, both: list[SelectionPacking], restarting: list[SelectionPacking]
+) -> None:
+    """Play games that end, with the choices of the first, and games that begin again."""
+    first, second = restarting
+    for turn in range(TURNS):
+        choice = player(first)
+        first.place(*choice)
+        if turn < TURNS // 2:
+            second.place(*choice)
+        else:
+            second.load_state_dict(first.state_dict())
+        compare(first, second)
+        if bool(both[0].alive.any()):
+            choice = player(both[0])
+            for game in both:
+                game.place(*choice)
+            compare(*both)
+            check(both[0])
+
+
+def compare(game: SelectionPacking, other: SelectionPacking) -> None:
+    """Check that two games with the same choices are equal."""
     assert torch.equal(game.selection_mask, other.selection_mask)
-    assert torch.equal(game.state.slots, other.state.slots)
     assert torch.equal(game.bins.heightmap, other.bins.heightmap)
+    for name in ("mask", "slots", "t", "episode", "packed", "placed", "opened", "closed", "ended"):
+        assert torch.equal(getattr(game.state, name), getattr(other.state, name)), name
+
+
+def check(game: SelectionPacking) -> None:
+    """Check what holds in every turn."""
     # A legal option has a placement, and games that go on have a legal option.
     some = game.state.mask.flatten(2).any(2) & ~game.state.ended[:, None]
     assert torch.equal(game.selection_mask, some)
