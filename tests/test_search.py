@@ -404,6 +404,24 @@ def test_a_search_for_one_box_is_the_search_with_selection() -> None:
     assert (chosen[0] == orientation)[game.moves.orientations[:, 2]].all()
 
 
+def test_a_few_draws_count_less_than_the_critic(monkeypatch: pytest.MonkeyPatch) -> None:
+    lookahead = lookahead_of(load("rs").policy)
+    assert lookahead is not None
+    settings, stream = BudgetSettings(draws=2), make_stream("rs", (10, 10, 10), (2, 5))
+    game = SelectionPacking(6, "rs", spec=SelectionSpec(), seed=4)
+    for _ in range(6):
+        game.place(*GreedyValue(lookahead)(game))
+
+    def choices(trust: float) -> list[list[int]]:
+        monkeypatch.setattr("marl_pack.agents.selection.budget.TRUST", trust)
+        chosen = BudgetSearch(lookahead, settings, stream)(game)
+        return [choice.tolist() for choice in chosen]
+
+    critic = [choice.tolist() for choice in Beam(lookahead, BeamSettings(settings.width))(game)]
+    assert choices(1e9) == critic
+    assert choices(0.0) != critic
+
+
 def test_boxes_are_drawn_as_often_as_they_come() -> None:
     kinds = kinds_of(make_stream("rs", (10, 10, 10)), GameSpec(), -1)
     assert len(kinds.reached) == 20

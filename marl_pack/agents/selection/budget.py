@@ -7,7 +7,8 @@
    for the rest. A *draw* is one such future.
 3. The half of the candidates with the better means gets more draws, and so on, until the time or
    the number of draws is used up (sequential halving, Karnin et al. 2013). The first placement of
-   the best candidate is chosen.
+   the best candidate is chosen. A mean of few draws counts little beside the critic's value
+   (:data:`TRUST`).
 
 Drawn boxes come from the distribution of the stream, never from the game's hidden boxes. Equal bins
 are computed once, however they were reached.
@@ -45,6 +46,8 @@ AHEAD = 3
 """Number of drawn boxes that are placed in each future."""
 ROWS = 64
 """Number of futures, of all candidates together, that are played at once."""
+TRUST = 4.0
+"""Draws that the critic's value of a candidate is worth: fewer draws change little."""
 SAME = 1e-7
 """Candidates whose values differ by less are mirrored or rotated copies."""
 Floats = NDArray[np.float64]
@@ -133,7 +136,9 @@ class _Futures:
         self.shift = generator.random(game.k + AHEAD - 1)
 
     def mean_gains(self, value: Floats, start: float, deadline: float) -> Floats:
-        """Return what each candidate gains on average, [C]; -inf for those that were left.
+        """Return what each candidate gains, [C]; -inf for those that were left.
+
+        A mean of few draws is shrunk towards 0, the critic's own estimate.
 
         Args:
             value: float64 [C], the values of the candidates so far.
@@ -158,7 +163,7 @@ class _Futures:
                 total[left] += self._play(left, drawn, n).sum(1)
                 played, drawn = played + n, drawn + n
                 cost = max(1.0, clock() - begin) / (n * len(left))
-            mean[left] = total[left] / drawn
+            mean[left] = total[left] / (drawn + TRUST)
             if k < rounds:
                 order = np.argsort(-(value + mean)[left], kind="stable")
                 dropped = left[order[-(-len(left) // 2) :]]
