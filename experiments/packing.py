@@ -83,9 +83,10 @@ SELECTION = {
     "buffer": [
         *(f"--policy rs {SETS['RS']} --buffer {k} --episodes 2100" for k in (2, 3, 5, 10)),
         *(f"--policy rs {SETS['RS']} --buffer {k} --episodes {n} {BEAM}"
-          for k, n in ((2, 500), (3, 500), (5, 500), (10, 100))),
+          for k, n in ((2, 500), (3, 500), (5, 2100), (10, 100))),
         *(f"--policy types125 {TYPES} --buffer {k} --episodes {n}"
-          for k, n in ((2, 2100), (3, 2100), (5, 1000), (10, 500))),
+          for k, n in ((2, 2100), (3, 2100), (5, 2100), (10, 500))),
+        f"--policy types125 {TYPES} --buffer 10 --episodes 2100 --plan width=2,depth=2",
         *(f"--policy types125 {TYPES} --buffer {k} --episodes {n} {BEAM}"
           for k, n in ((2, 500), (5, 100), (10, 100))),
         *(f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")),
@@ -93,18 +94,24 @@ SELECTION = {
     "preview": [
         f"--policy rs {SETS['RS']} --episodes {n} --preview {p} --plan width={width}"
         for p, width, n in (
-            (1, 32, 500), (2, 32, 500), (3, 32, 500), (5, 8, 500), (5, 32, 200), (10, 32, 100)
+            (1, 32, 500), (2, 32, 500), (3, 32, 500), (5, 8, 500), (5, 32, 2100), (10, 32, 100)
         )
     ],
     "bins": [
         f"--policy {policy} --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"
         for policy in ("rs", "dblf") for b in (1, 2, 3, 4)
     ],
+    "trained": [
+        *(f"--policy rs_buffer5 {SETS['RS']} --buffer {k} --episodes 2100" for k in (3, 5, 10)),
+        *(f"--policy rs_bins2 --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"
+          for b in (2, 3)),
+    ],
     "budget": [
         f"--policy rs {SETS['RS']} --episodes {n} {options}"
         for options, n in (
-            ("--plan draws=4", 100), ("--plan draws=16", 100),
-            ("--preview 1 --plan draws=8", 50), ("--buffer 3 --plan draws=8", 50),
+            ("--plan budget=10ms", 200), ("--plan budget=30ms", 200), ("--plan budget=100ms", 200),
+            ("--plan draws=16", 100),
+            ("--preview 1 --plan budget=100ms", 50), ("--buffer 3 --plan budget=100ms", 50),
         )
     ],
 }  # fmt: skip

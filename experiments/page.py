@@ -8,6 +8,7 @@ the programs of ``experiments/`` and ``benchmarks/`` write.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -255,16 +256,21 @@ def render_buffer(folder: Path = RESULTS) -> str:
     table = tables_in(folder)["selection"]
     page = PAGE.with_name("buffer.md").read_text(encoding="utf-8")
     for option, keys in packing.SELECTION.items():
+        head = ["`evaluate`", "episodes", "utilization %", "boxes", "ms a decision", "falls"]
+        head += ["adds to greedy value"] * (option == "trained")
         lines = []
         for key in keys:
             row = table.row(key)
-            falls = f"{row['falls']} of {row['judged_episodes']}" if "falls" in row else "–"
-            lines.append((
+            falls = f"{row['falls']} of {row['judged_episodes']:,}" if "falls" in row else "–"
+            line = [
                 f"`{key}`", f"{row['episodes']:,}", utilization(row), f"{row['packed']:.1f}",
                 f"{1000 * row['cpu_seconds'] / (row['episodes'] * row['packed']):.1f}", falls,
-            ))  # fmt: skip
-        head = ("`evaluate`", "episodes", "utilization %", "boxes", "ms a decision", "falls")
-        page = between(page, option, markdown_table(head, *lines))
+            ]  # fmt: skip
+            if option == "trained":
+                greedy = table.row(re.sub(r"--policy \S+", "--policy rs", key))
+                line.append(signed(difference(row, greedy)))
+            lines.append(tuple(line))
+        page = between(page, option, markdown_table(tuple(head), *lines))
     return between(page, "made", f"Made by {made(table)}.")
 
 
@@ -286,6 +292,12 @@ def fastest(rows: Mapping[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any
     for name, row in sorted(rows.items(), key=lambda item: item[1]["items_per_second"]):
         best[re.sub(r", N = [\d,]+\d", "", name)] = name, row
     return list(best.values())
+
+
+def difference(row: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, float]:
+    """Return how much more a row fills than another, as if they had independent sequences."""
+    halves = [(each["interval"][1] - each["interval"][0]) / 2 for each in (row, other)]
+    return {"mean": row["utilization"] - other["utilization"], "half": math.hypot(*halves)}
 
 
 def percent(share: float | Mapping[str, float], digits: int = 2) -> str:
