@@ -1,4 +1,4 @@
-"""Read settings that an option has in one text, such as ``budget=500ms,top=8``."""
+"""Read the settings of ``--plan`` from text such as ``budget=500ms,top=8``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from marl_pack.checks import real_number
-
-LONGEST_BUDGET_MS = 1e9
-"""The longest time that a search may have for a decision."""
 
 
 def settings_in(
@@ -51,5 +48,5 @@ def milliseconds(word: str) -> float | None:
 def check_budget(budget_ms: float) -> None:
     """Raise ValueError unless a time for a decision is possible."""
     budget = real_number(budget_ms, "budget")
-    if not 0 < budget <= LONGEST_BUDGET_MS:
+    if not 0 < budget <= 1e9:
         raise ValueError(f"budget {budget:g} ms: needs more than 0 ms, at most 1e9 ms")

@@ -47,7 +47,7 @@ AHEAD = 3
 ROWS = 64
 """Number of futures, of all candidates together, that are played at once."""
 TRUST = 4.0
-"""Draws that the critic's value of a candidate is worth: fewer draws change little."""
+"""Weight of the critic's value, in draws: a mean of n draws counts n / (n + TRUST)."""
 SAME = 1e-7
 """Candidates whose values differ by less are mirrored or rotated copies."""
 Floats = NDArray[np.float64]
