@@ -79,6 +79,7 @@ TABLES = {
 }
 TYPES = "--items rs --sides 1 5 --seed 0"
 BEAM = "--plan width=8,depth=4"
+NARROW = "--plan width=4,depth=2"
 SELECTION = {
     "buffer": [
         *(f"--policy rs {SETS['RS']} --buffer {k} --episodes 2100" for k in (2, 3, 5, 10)),
@@ -86,16 +87,18 @@ SELECTION = {
           for k, n in ((2, 500), (3, 500), (5, 2100), (10, 100))),
         *(f"--policy types125 {TYPES} --buffer {k} --episodes {n}"
           for k, n in ((2, 2100), (3, 2100), (5, 2100), (10, 500))),
+        f"--policy rs {SETS['RS']} --buffer 10 --episodes 2100 {NARROW}",
+        f"--policy types125 {TYPES} --buffer 5 --episodes 2100 {NARROW}",
         f"--policy types125 {TYPES} --buffer 10 --episodes 2100 --plan width=2,depth=2",
         *(f"--policy types125 {TYPES} --buffer {k} --episodes {n} {BEAM}"
           for k, n in ((2, 500), (5, 100), (10, 100))),
         *(f"--policy {name} {SETS['RS']} --buffer 5" for name in ("dblf", "random")),
     ],
     "preview": [
-        f"--policy rs {SETS['RS']} --episodes {n} --preview {p} --plan width={width}"
-        for p, width, n in (
-            (1, 32, 500), (2, 32, 500), (3, 32, 500), (5, 8, 500), (5, 32, 2100), (10, 32, 100)
-        )
+        f"--policy rs {SETS['RS']} --episodes 2100 --preview 1",  # greedy value does not look at it
+        *(f"--policy rs {SETS['RS']} --episodes {n} --preview {p} --plan width={width}"
+          for p, width, n in (
+            (1, 32, 500), (2, 32, 500), (3, 32, 500), (5, 8, 500), (5, 32, 2100), (10, 32, 100))),
     ],
     "bins": [
         f"--policy {policy} --items rs --episodes 100 --seed 0 --bins {b} --closings {20 * b}"

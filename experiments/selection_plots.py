@@ -76,7 +76,10 @@ def draw(measured: list[Point], picture: Path) -> None:
     figure, panels = plt.subplots(2, 2, figsize=(10, 7.5), layout="constrained")
     one_bin = [p for p in measured if p.closings is None]
     lines(panels[0, 0], [p for p in one_bin if p.preview == 0], "buffer", "visible boxes")
-    seen = [p for p in one_bin if p.buffer == 1 and p.policy == "rs"]
+    seen = [
+        p for p in one_bin
+        if p.buffer == 1 and p.policy == "rs" and (p.plan or not p.preview)  # greedy: no preview
+    ]  # fmt: skip
     lines(panels[0, 1], seen, "preview", "boxes of the preview, order fixed")
     lines(panels[1, 0], [p for p in measured if p.closings], "bins", "open bins")
     time = panels[1, 1]

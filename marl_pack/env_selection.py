@@ -1,9 +1,9 @@
 """The packing game with a buffer, a preview or several bins, as a PettingZoo environment.
 
-`env_aec.env(buffer=5)` returns it: :mod:`marl_pack.env_aec` with one of the options `buffer` = k,
-`preview` = p, `bins` = b and `closings`. k boxes are visible, and b bins are open. An agent that
-acts first selects a box and a bin. Turns, masks, the shared reward and all other arguments are
-those of :mod:`marl_pack.env_aec`.
+`env_aec.env(buffer=5)` returns it: :mod:`marl_pack.env_aec` with one or more of the settings
+`buffer` = k, `preview` = p, `bins` = b and `closings`. k boxes are visible, and b bins are open. An
+agent that acts first selects a box and a bin. Turns, masks, the shared reward and all other
+arguments are those of :mod:`marl_pack.env_aec`.
 
 | | |
 |---|---|
@@ -49,10 +49,16 @@ When no visible box has a place in any bin, the fullest bin is closed and replac
 | 3 k | sides of each visible box; 0 for an empty slot |
 | 3 p | sides of each box of the preview, the next one first; 0 after the end of the sequence |
 
-The selection agent sees 0 in the first four. With k = b = 1 there are no planes of bins and slots.
-All lengths are divided by the longest side of the bin. With `pad_actions=True` all agents have the
-same spaces, and one more plane says who acts: 0 for the orientation agent, 1 for the placement
-agent, 0.5 for the selection agent. `state()` has what the acting agent sees, and this plane.
+So P = 4 + b + 3 k + 3 p. The selection agent sees 0 in the first four. With k = b = 1 there are no
+planes of bins and slots, and P = 4 + 3 p. All lengths are divided by the longest side of the bin.
+With `pad_actions=True` all agents have the same spaces, and one more plane says who acts: 0 for the
+orientation agent, 1 for the placement agent, 0.5 for the selection agent. `state()` has the P
+planes of the acting agent, and this plane.
+
+## Reward
+
+It is that of `env_aec`, as a share of one bin: with several bins, a reward of 1 fills one of
+them.
 
 ## What was packed
 

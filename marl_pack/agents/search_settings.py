@@ -10,6 +10,8 @@ from marl_pack.settings_text import count, settings_in
 MOST = 1 << 20
 """Largest number of futures in one decision."""
 
+NEEDS = "needs rollouts=K, top=M or depth=D (width=W goes with a buffer, a preview or several bins)"
+
 
 @dataclass(frozen=True)
 class SearchSettings:
@@ -45,4 +47,4 @@ class SearchSettings:
             ValueError: if the text has another form; the message says which form is needed.
         """
         readers = dict.fromkeys(("rollouts", "top", "depth"), count)
-        return cls(**settings_in(text, readers, "needs rollouts=K, top=M or depth=D"))
+        return cls(**settings_in(text, readers, NEEDS))

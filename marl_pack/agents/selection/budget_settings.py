@@ -20,8 +20,9 @@ class BudgetSettings:
 
     Args:
         budget_ms: milliseconds for a decision; None for no limit, which needs ``draws``.
-        draws: largest number N of drawn futures for each decision. With a number and no budget, the
-            search does not depend on the speed of the machine. None: as many as there is time for.
+        draws: largest mean number N of drawn futures of a candidate. With a number and no budget,
+            the search does not depend on the speed of the machine. None: as many as there is time
+            for.
         width: number of nodes that are kept at each depth among the known boxes.
     """
 
