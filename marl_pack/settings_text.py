@@ -36,7 +36,7 @@ def settings_in(
 
 def count(word: str) -> int | None:
     """Read a whole number such as ``16``."""
-    return int(word) if re.fullmatch("[0-9]{1,9}", word) else None
+    return int(word) if re.fullmatch("[0-9]{1,18}", word) else None
 
 
 def milliseconds(word: str) -> float | None:

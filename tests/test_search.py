@@ -352,6 +352,15 @@ def test_a_budget_search_plays_on_with_few_visible_boxes_and_full_bins() -> None
         assert (game.utilization > 0.6).all()
 
 
+@pytest.mark.parametrize("side", [5, 2])
+def test_a_budget_search_draws_more_boxes_than_the_sequences_have(side: int) -> None:
+    items = np.full((1, 6 if side == 2 else 40, 3), side)  # memory for 6 and 8 boxes in a bin
+    game, policy = selecting(1, items), budget_search("draws=2,width=2")
+    while bool(game.alive.any()):
+        game.place(*policy(game))
+    assert int(game.state.placed) >= 1
+
+
 def test_a_budget_search_is_a_beam_where_everything_is_known() -> None:
     items = np.random.default_rng(2).integers(2, 6, (6, 4, 3))
     game = selecting(6, items, preview=5)
@@ -463,7 +472,8 @@ def test_settings_of_a_budget_are_read(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [("budget=5", "needs budget=100ms"), ("budget=0ms", "more than 0"), ("width=3", "needs a"),
-     ("draws=2,draws=3", "given twice"), ("draws=9999999", "draws"), ("top=3", "needs budget")],
+     ("draws=2,draws=3", "given twice"), ("draws=9999999", "draws"), ("top=3", "needs budget"),
+     ("draws=100000000000", "draws: needs a whole number from 1 to")],
 )  # fmt: skip
 def test_impossible_budgets_are_refused(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):

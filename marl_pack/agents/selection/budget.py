@@ -126,7 +126,9 @@ class _Futures:
     """
 
     def __init__(self, search: BudgetSearch, game: SelectionPacking, g: int, bins: Bins) -> None:
-        self.search, self.bins, self.k, self.b = search, bins, game.k, game.b
+        self.search, self.k, self.b = search, game.k, game.b
+        # Drawn boxes may be smaller, and more, than those of the game's own sequences.
+        self.bins = bins.for_boxes(bins.boxes.shape[1] + AHEAD)
         self.kinds, self.one = search.kinds(game), game.view(torch.tensor([g * game.options]))
         self.best = BestPlacements(search.lookahead, self.kinds, self.one)
         self.last = bool(game.state.closed[g] + 1 >= game.spec.most_closings)
